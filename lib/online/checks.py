@@ -1,54 +1,16 @@
 """Is a frame fit to be used?  What images and report tell by themselves, before any rig is asked."""
 
-from itertools import product
-from typing import NamedTuple, Self
-
 import cv2
 import numpy as np
 
 from lib.correspondences import Correspondences
+from lib.recordings import Scene
 
-_STEP = 4  # every n-th pixel is compared; the noise of a sensor never repeats
 _DARK, _FLAT = 6.0, 1.5  # grey levels: an image that is darker on average, or varies less, shows nothing
 _REPEATED_PX = 0.3  # a detector finds the same landmarks in the same image within this
 _MOVED_PX = 5.0  # landmarks that all moved farther than this moved
 _RESTARTED = 10  # frames in order that are older than one before: then the clock is another
 _FAR_MM = 300.0  # from where the robot was: beyond any tool's reach
-_SCENE_PX, _TILES = (384, 216), 4  # size at which scenes are compared, in 4 x 4 tiles, whose sides suit OpenCV's transform
-_TEXTURE, _FEWEST, _LEAST_PX = 0.1, 4, 16  # least response of a tile that shows anything, fewest of them, least size
-
-
-class Scene(NamedTuple):
-    """What two images show, to tell whether it moved: every fourth pixel of each, (h, w, 3) uint8."""
-
-    left: np.ndarray
-    right: np.ndarray
-
-    def moved_px(self, other: Self) -> np.ndarray:
-        """(2,) px of the full images by which nearly all of the left and right image moved to `other`, at most.
-
-        NaN where they show too little to tell.  The tool covers a few tiles, and what surrounds it decides.
-
-        >>> dots = np.random.default_rng(0).integers(0, 255, (27, 48), dtype=np.uint8)
-        >>> dots = cv2.resize(cv2.merge([dots] * 3), (480, 270), interpolation=cv2.INTER_CUBIC)
-        >>> before, now = Scene(dots, dots), Scene(dots, np.roll(dots, 5, axis=1))
-        >>> before.moved_px(now).round().astype(int)
-        array([ 0, 20])
-        """
-        return np.array([_moved_px(*pair) for pair in zip(self, other, strict=True)])
-
-
-def _moved_px(*images: np.ndarray) -> float:
-    if min(images[0].shape[:2]) < _TILES * _LEAST_PX or images[0].shape != images[1].shape:
-        return np.nan
-    scale, tile = _STEP * np.array(images[0].shape[1::-1]) / _SCENE_PX, np.array(_SCENE_PX) // _TILES
-    small = [cv2.resize(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY), _SCENE_PX, interpolation=cv2.INTER_AREA) for one in images]
-    window, moved = cv2.createHanningWindow(tile, cv2.CV_32F), []
-    for x, y in product(*(size * np.arange(_TILES) for size in tile)):
-        parts = (one[y : y + tile[1], x : x + tile[0]].astype(np.float32) for one in small)
-        shift, response = cv2.phaseCorrelate(*parts, window)
-        moved += [np.linalg.norm(scale * shift)] if response > _TEXTURE else []
-    return float(np.quantile(moved, 0.8)) if len(moved) >= _FEWEST else np.nan
 
 
 class FrameChecks:
@@ -66,7 +28,7 @@ class FrameChecks:
         if pair[0].ndim != 3 or pair[0].shape[2] != 3 or pair[0].dtype != np.uint8 or pair[1].shape != pair[0].shape:
             shapes = " and ".join(str(image.shape) for image in pair)
             raise ValueError(f"left, right: expected two (h, w, 3) uint8 images, got {shapes}.")
-        scene = Scene(*(np.ascontiguousarray(image[::_STEP, ::_STEP]) for image in pair))
+        scene = Scene.of(*pair)
         looks = zip(("left", "right"), map(cv2.meanStdDev, scene), strict=True)
         names = [name for name, (mean, sd) in looks if mean.mean() < _DARK or sd.max() < _FLAT]
         self._same = np.array([np.array_equal(now, before) for now, before in zip(scene, self.scene, strict=True)])

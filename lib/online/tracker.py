@@ -13,8 +13,8 @@ from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.online.causes import CONVINCING, explain, misfit
-from lib.online.checks import Scene
 from lib.online.result import FrameResult, Settings
+from lib.recordings import Scene
 from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import Verdict, judge
 

@@ -11,8 +11,9 @@ from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, encoded, read_image, to_8_bits
 from lib.recordings.ground import Ground, GrowingGround
 from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWriter
+from lib.recordings.scene import Scene
 from lib.recordings.smoothing import smoothed
 from lib.recordings.truth import Truth
 
 __all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Ground", "GrowingGround", "Kinematics", "Recording"]
-__all__ += ["RecordingWriter", "StereoFrame", "Truth", "encoded", "read_image", "smoothed", "to_8_bits"]
+__all__ += ["RecordingWriter", "Scene", "StereoFrame", "Truth", "encoded", "read_image", "smoothed", "to_8_bits"]

@@ -115,8 +115,9 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
             cure = "Look for images that one camera lost, and pair left and right images of one instant."
         counts = np.bincount(own, minlength=len(shifts)) / case.frames
         chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
+        chosen += 0.5 * np.count_nonzero(counts) * np.log(case.frames)
         raw, size = fit.total - case.null.total - chosen, (100 * share, 0.0, "%")
-        yield case.found("frame_order", fit, np.count_nonzero(counts), size, text, cure, on=moved, raw=raw, images=views)
+        yield case.found("frame_order", fit, 1, size, text, cure, on=moved, raw=raw, images=views)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:

@@ -27,6 +27,7 @@ SIDES = ("left", "right")
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
 _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
+_NEARLY_SHUT, _OF_SHUT = 0.15, 3.0  # jaws that open less, of the tool's length, and by how much more noise these have
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
@@ -112,10 +113,15 @@ class Problem:
         with np.errstate(all="ignore"):
             noise = np.sqrt(variance / np.nanmedian(variance)) if np.isfinite(variance).any() else variance
         noise = np.clip(np.where(np.isfinite(noise), noise, 1.0), 0.5, 4.0)
+        frame = np.unique(data.frame, return_inverse=True)[1]
+        if axes.any():  # offsets turn those of jaws that are nearly shut
+            tool = data.grid("x_mm")
+            opening, length = tool[:, 2] - tool[:, 1], (tool[:, 1] + tool[:, 2]) / 2 - tool[:, 0]
+            shut = np.linalg.norm(opening, axis=1) < _NEARLY_SHUT * np.linalg.norm(length, axis=1)
+            noise *= np.where(shut, _OF_SHUT, 1.0)[frame, None]
         centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
         y = np.stack([data.u_left, data.u_right], axis=1)
         x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)
-        frame = np.unique(data.frame, return_inverse=True)[1]
         centre_px = (np.array(size) - 1) / 2 if size else np.nanmedian(y, axis=(0, 1)) if len(data) else np.zeros(2)
         return cls(x, y, data.seen, noise, axes, frame, data.landmark, data.time_s, centre, centre_px)
 
@@ -171,9 +177,10 @@ class Problem:
             columns = self.of_later_cameras(frame)
             return self.fit(lambda M: columns, start=fit.start)
 
-        cut = int(left.argmin()) + 2
-        for step in (max(frames // 8, 1), max(frames // 16, 1), max(frames // 32, 1), 1, 1):
-            cut = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
+        cut, step = int(left.argmin()) + 2, max(frames // 5, 1)
+        while step:
+            best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
+            step, cut = step if best != cut else step // 2, best
         return cut, parted(cut)
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:

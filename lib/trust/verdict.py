@@ -14,7 +14,7 @@ from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_
 from lib.calibration.checks import extents
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
-from lib.recordings import Doubt, Recording
+from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import BY_GEOMETRY
@@ -59,6 +59,8 @@ LIMITS: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 #: Pixel noise assumed where the detections claim none: that of labels set by hand.
 _LABEL_PX = 3.0
+#: A scene contradicts cameras by which landmarks move more than this, px, and so many times as far as the scene.
+_NEARER_PX, _TIMES = 1.0, 3.0
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
@@ -290,6 +292,13 @@ def assess(
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated)
+    if (best := diagnosis.best) is not None and best.name == "camera_moved" and len(best.images) == 2:
+        pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
+        first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
+        if (best.value > _NEARER_PX + _TIMES * first.moved_px(last)).all():  # not of a scene that tells nothing
+            text = f"{best.text} But what lies behind the tool stands still: the robot's report jumped."
+            jumped = replace(best, name="robot_jumped", text=text, cure="Calibrate before and after on their own.")
+            diagnosis = Diagnosis(tuple(jumped if h is best else h for h in diagnosis.hypotheses))
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
