@@ -14,7 +14,8 @@ from lib.trust.health import feature_matches
 
 #: Distances count up to this share of the tool's length, and so does a landmark that is missing.
 _CAP = 0.1
-_FEWEST, _NEAR_PX = 16, 1.5  # matches that tell an epipolar geometry, and how far from it right ones may lie
+#: Matches that tell an epipolar geometry, of seven numbers, and how far from it right ones may lie.
+_FEWEST, _NEAR_PX = 16, 1.5
 
 
 def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
@@ -82,10 +83,10 @@ def epipolar_px(recording: Recording, seen: Sequence[Seen], others: Seen) -> lis
     """
     matches = np.concatenate([feature_matches(recording, seen[0].frame), others.stacked_px.reshape(-1, 4)])
     left, right = np.split(matches[np.isfinite(matches).all(axis=1)], 2, axis=1)
-    F = None
+    F, agree = None, np.zeros(0)
     if len(left) >= _FEWEST:
-        F = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, _NEAR_PX, 0.9999, 5000)[0]
-    if F is None:
+        F, agree = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, _NEAR_PX, 0.9999, 5000)
+    if F is None or agree.sum() < max(_FEWEST, 0.25 * len(left)):
         raise RefusalError("images: left and right share too few features and landmarks, so nothing could judge a gain.")
     found = []
     for one in seen:

@@ -83,8 +83,8 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     first = np.unique(rows.frame)[problem.other_cameras(fit)[0]]
     parts = frames[frames < first], frames[frames >= first]
     own = sum(Problem.of(rows.of_frames(part), recording.image_size_px).fit().total for part in parts)
-    # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
-    if own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
+    # Cameras of their own have 16 numbers more, and the cut could lie anywhere.  Few frames fit some by chance.
+    if min(map(len, parts)) < 0.15 * len(frames) or own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
     what = f"The cameras moved, or the tool slipped, at about frame {first}"
@@ -187,7 +187,7 @@ def teach(
     used = seen.of(np.setdiff1d(seen.frame, refused))
     if len(used.frame) < 5:
         raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
-    recording, calibration, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
+    recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
     told, turns = calibration.offsets, False
@@ -205,6 +205,8 @@ def teach(
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool "
                 f"has other dimensions. {_LABEL}"
             )
+        if fault is not None and not (alone or clicked):
+            raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector takes other points for the tips. {_LABEL}")
         turns = told.turns
         offset, covariance = _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
     elif before is not None:
@@ -256,8 +258,12 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
     return np.asarray(frames)[held_s[np.searchsorted(first, nearest, side="right") - 1] > _HELD_S]
 
 
-def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Recording, Calibration, float, float]:
+def _aligned(
+    recording: Recording, seen: Seen, *, by_hand: bool
+) -> tuple[Recording, Calibration, Hypothesis | None, float, float]:
     """The recording with the clock's offset that cameras tell, the cameras, the offset's deviation, the share that agrees.
+
+    Third is a fault that may be the detector's as well: jaws of another opening.
 
     A `RefusalError` where no cameras of a stereo microscope explain what is seen (or marked, if `by_hand`), or a fault does.
     """
@@ -288,9 +294,9 @@ def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Record
         recording = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value)
         clock_sd_s = 1e-3 * fault.sd
         calibration = calibrated(recording)
-    if fault is not None:
+    if fault is not None and fault.name != "jaw_opening":
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
-    return recording, calibration, clock_sd_s, float(calibration.view_inliers.sum() / max(_told(recording, seen), 1))
+    return recording, calibration, fault, clock_sd_s, float(calibration.view_inliers.sum() / max(_told(recording, seen), 1))
 
 
 def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[Recording, float]:

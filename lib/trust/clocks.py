@@ -99,9 +99,9 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # lost frames may add up: most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
-    steps_px = np.abs(np.diff(case.by_frame(case.problem.y), axis=0)).max(axis=(1, 3), initial=0.0)
+    steps_px = np.nan_to_num(np.abs(np.diff(case.by_frame(case.problem.y), axis=0))).max(axis=(1, 3), initial=0.0)
     for views in ((0, 1), (0,), (1,)):
-        if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.02:
+        if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:
             continue  # images come twice
         fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
         others = 1e3 * shifts[own][np.abs(shifts[own]) > step / 2]
@@ -109,7 +109,8 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"
-        text = f"{100 * share:.0f} % of the {what} belong to other instants, mostly {low:+.0f} to {high:+.0f} ms off."
+        span = f"{low:+.0f} ms" if high - low < 1 else f"{low:+.0f} to {high:+.0f} ms"
+        text = f"{100 * share:.0f} % of the {what} belong to other instants, mostly {span} from those stated."
         cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
         if len(views) == 1:
             cure = "Look for images that one camera lost, and pair left and right images of one instant."

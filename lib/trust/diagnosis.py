@@ -24,7 +24,7 @@ from lib.trust.optics import axes_and_eyes, finite_distance, lens
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
-_LEAST_SPIKE_MM = 0.2
+_SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
@@ -75,7 +75,7 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
     """Tips that move by other amounts than the base."""
     tips = case.problem.landmark > 0
-    if 0 < tips.mean() < 1:
+    if 0 < tips.mean() < 1 and case.problem.landmark.max() <= 2:
         x = case.problem.x * tips[:, None, None]
         fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
@@ -85,34 +85,45 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
 
 
 def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
-    """Tips that lie by a factor farther apart than the robot reports."""
+    """Tips that lie by a factor farther apart than the robot reports; of a constant opening that is but an offset."""
     tips = case.by_frame(case.problem.x[:, 0])[:, 1:]
-    share = np.array([0.0, -0.5, 0.5, 0.0])[np.minimum(case.problem.landmark, 3)]
+    width = np.linalg.norm(tips[:, 1] - tips[:, 0], axis=1)
+    width = width[np.isfinite(width)]
+    if case.problem.landmark.max() != 2 or not len(width) or _is_constant(width):
+        return
+    share = np.array([0.0, -0.5, 0.5])[case.problem.landmark]
     half = (tips[:, 1] - tips[:, 0])[case.problem.frame] * share[:, None]
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None])
     factor, sd = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
     if 0.0 < factor < 1.0 / _OPENED or factor > _OPENED:  # below 0 they are exchanged
         text = f"In the images the tips are {factor:.2f} +- {sd:.2f} times as far apart as in the robot's report."
-        cure = "Is the opening that it states one jaw's or both jaws'? Check that, and the length of the jaws."
+        cure = "Does the robot's log state the opening of one jaw or of both? Check that, and the length of the jaws."
         yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
+
+
+def _is_constant(width_mm: np.ndarray) -> bool:
+    """Whether the robot reports one opening of the jaws, but for its noise."""
+    return bool(width_mm.std() <= max(0.02 * width_mm.mean(), 0.03))
 
 
 def _log_spikes(case: Case) -> Iterator[Hypothesis]:
     """Single samples of the robot's log that lie elsewhere than those before and after them."""
-    if case.kinematics is None:
+    found, sizes = [], []
+    for own in np.swapaxes(case.log, 0, 1) if case.kinematics else ():
+        if (known := np.isfinite(own).all(axis=1)).sum() >= _SPIKED:
+            x = own[known]
+            away, step = (np.linalg.norm(d, axis=1) for d in (x - median_filter(x, (_SPIKED, 1)), np.diff(x, axis=0)))
+            spikes = away > max(_LEAST_SPIKE_MM, 10 * np.quantile(step, 0.25))
+            found, sizes = [*found, *case.kinematics.time_s[known][spikes]], [*sizes, *away[spikes]]
+    if not found:
         return
-    known = np.isfinite(case.log).all(axis=(1, 2))
-    time, x = case.kinematics.time_s[known], case.log[known]
-    others = median_filter(x, (5, 1, 1))
-    away, step = (np.linalg.norm(d, axis=2).max(axis=1) for d in (x - others, np.diff(x, axis=0)))
-    spikes = np.flatnonzero(away > max(_LEAST_SPIKE_MM, 10 * np.quantile(step, 0.25)))
-    hit = np.abs(case.at_s[:, None] - time[spikes]).min(axis=1, initial=np.inf) < np.median(np.diff(time))
+    time_s, step_s = np.unique(found), np.median(np.diff(case.kinematics.time_s))
+    hit = np.abs(case.at_s[:, None] - time_s).min(axis=1) < step_s
     if not hit.all() and len(np.unique(case.problem.frame[hit])) >= 3:
-        fit = case.problem.fit(start=case.null.start, apart=hit)
-        size, first = np.median(away[spikes]), time[spikes[0]]
-        text = f"{len(spikes)} samples of kinematics.csv jump by {size:.2g} mm (median) and back, the first at {first:.2f} s."
+        fit, size = case.problem.fit(start=case.null.start, apart=hit), np.median(sizes)
+        text = f"{len(time_s)} samples of kinematics.csv jump by {size:.2g} mm (median) and back, first at {time_s[0]:.2f} s."
         cure = "Leave these cells of kinematics.csv blank."
-        yield case.found("log_spikes", fit, 2, (len(spikes), 0.0, "samples"), text, cure)
+        yield case.found("log_spikes", fit, 2, (len(time_s), 0.0, "samples"), text, cure)
 
 
 def _drift(case: Case) -> Iterator[Hypothesis]:
@@ -124,7 +135,8 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     cure = "Fix the microscope and the robot, or calibrate a shorter part (Correspondences.of_frames)."
     for columns, what in ((late[..., 3], "images creep"), (late, "cameras turn, zoom or move steadily: the images change")):
         fit = case.linear(columns.reshape(len(time), 2, 2, -1))
-        size = float(np.sqrt(12.0 * (fit.moved_px**2).sum(axis=2).mean()))  # the RMS of a line is 1/sqrt(12) of its range
+        moved_px = fit.moved_px[case.problem.used]
+        size = float(np.sqrt(12.0 * (moved_px**2).sum(axis=1).mean()))  # the RMS of a line is 1/sqrt(12) of its range
         text = f"The {what} by {size:.1f} px from the first frame to the last."
         yield case.found("drift", fit, fit.theta.size, (size, 0.0, "px"), text, cure)
 
@@ -168,7 +180,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     if fit.total > both.total - _AS_GOOD:
         size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
         text = f"The tool slipped at about frame {frame} of those seen, by {size:.0f} um ({along} um in the tool's axes)."
-        cure = "Fix the tool in its holder, or calibrate before and after on their own."
+        cure = "Fix the tool in its holder, or calibrate before and after on their own. "
+        cure += "Where the tool does not turn, a robot whose zero changed looks the same."
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     for views in ((0, 1), (0,), (1,)):
         fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
@@ -210,7 +223,8 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         yield certain("frozen_kinematics", fit, frozen, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
-    for views, twice in (([0, 1], left & right), ([0], left & ~right), ([1], right & ~left)):
+    far = [step > 8 * noise for step in steps]  # of one image alone the other tells whether the tool moved
+    for views, twice in (([0, 1], left & right), ([0], left & far[1]), ([1], right & far[0])):
         if twice.mean() < 0.02 or twice.all():
             continue
         # Each image belongs to the instant at which it was first seen.
@@ -229,7 +243,7 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     problem, tips = case.problem, case.by_frame(case.problem.x[:, 0])
     width = np.linalg.norm(tips[:, 2] - tips[:, 1], axis=1)
     width = width[np.isfinite(width)]
-    if len(width) < 6 or width.std() > max(0.02 * width.mean(), 0.03):
+    if len(width) < 6 or not _is_constant(width):
         return
     side = np.select([problem.landmark == 1, problem.landmark == 2], [-1.0, 1.0], 0.0)
     fit, sd = case.null, 0.2
@@ -331,10 +345,13 @@ def diagnose(
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
-    tests = [_tip_order, _landmark_offset, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
+    tests = [_tip_order, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, _rigid_tips]
     found = [h for test in tests for h in test(whole if test is _frozen else case) if np.isfinite(h.gain)]
     best = Diagnosis(found := compared(found)).best
+    if best is None:  # other faults look like offsets, too
+        found += _landmark_offset(case)
+        best = Diagnosis(found).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
     more = [] if near else list(finite_distance(case, fit))

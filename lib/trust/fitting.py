@@ -119,6 +119,7 @@ class Problem:
             opening, length = tool[:, 2] - tool[:, 1], (tool[:, 1] + tool[:, 2]) / 2 - tool[:, 0]
             shut = np.linalg.norm(opening, axis=1) < _NEARLY_SHUT * np.linalg.norm(length, axis=1)
             noise *= np.where(shut, _OF_SHUT, 1.0)[frame, None]
+            noise /= np.median(noise)
         centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
         y = np.stack([data.u_left, data.u_right], axis=1)
         x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)

@@ -42,6 +42,8 @@ def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
 def lens(case: Case) -> Iterator[Hypothesis]:
     """Lenses that distort: pixels move towards the centre of the image, or away from it, by the cube of their distance."""
     problem = case.problem
+    if case.size is None:  # nothing tells where the images' centre is
+        return
 
     def columns(M: np.ndarray) -> np.ndarray:
         v = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - problem.centre_px
@@ -50,7 +52,8 @@ def lens(case: Case) -> Iterator[Hypothesis]:
 
     fit = case.linear(columns)
     left, right = 100 * fit.theta
-    text = f"The lenses distort: the corners of the left image lie {left:.1f} % too far out, of the right one {right:.1f} %."
+    where = [f"{abs(v):.1f} % too far {'out' if v > 0 else 'in'}" for v in (left, right)]
+    text = f"The lenses distort: the corners of the left image lie {where[0]}, those of the right one {where[1]}."
     cure = "`python3 -m lib calibrate RECORDING --model zero_skew+distance+radial` takes that on."
     size, sd = np.abs(fit.theta).max(), np.sqrt(np.trace(fit.covariance) / 2)
     raw = fit.total - case.null.total - 0.5 * ((fit.theta / _DISTORTION_SD) ** 2).sum()
@@ -144,7 +147,7 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
         if resized < least + _RATHER_RESIZED:
-            text += " They may be oblong as well because the images were resized, which does no harm."
+            text += " They may as well be oblong because the images were resized, which cameras take on."
             explained = min(explained, _UNDECIDED)
         yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
 

@@ -59,8 +59,9 @@ LIMITS: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 #: Pixel noise assumed where the detections claim none: that of labels set by hand.
 _LABEL_PX = 3.0
-#: A scene contradicts cameras by which landmarks move more than this, px, and so many times as far as the scene.
-_NEARER_PX, _TIMES = 1.0, 3.0
+#: A scene contradicts cameras by which landmarks move more than this, px, and so many times as far as the scene: the tool is
+#: nearer, but not by that much.  A scene that moved farther than the third contradicts a tool that slipped.
+_NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
@@ -181,7 +182,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
     text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
-    more = " With more frames, constant offsets of the landmarks are estimated, too." * (c.offsets is None)
+    more = " With more frames, constant offsets of the landmarks may be estimated, too." * (c.offsets is None)
     yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector.{more}"
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
@@ -230,8 +231,9 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
     mirrored, roll = optics(c).mirrored, abs(np.rad2deg(optics(c).roll_rad))
-    text = f"The right image is turned by {roll:.0f} degrees against the left one."
-    yield "roll", roll, text, "Turn it back: surfaces cannot be matched otherwise.", "turned_image"
+    text = f"The images are turned by {roll:.0f} degrees against each other."
+    if mirrored not in ("left", "right", "left or right"):  # a mirror image looks turned, too
+        yield "roll", roll, text, "Turn one of them back: surfaces cannot be matched otherwise.", "turned_image"
     text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
@@ -292,13 +294,17 @@ def assess(
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated)
-    if (best := diagnosis.best) is not None and best.name == "camera_moved" and len(best.images) == 2:
+    if (best := diagnosis.best) is not None and best.name in ("camera_moved", "tool_slipped") and len(best.images) == 2:
         pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
         first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-        if (best.value > _NEARER_PX + _TIMES * first.moved_px(last)).all():  # not of a scene that tells nothing
-            text = f"{best.text} But what lies behind the tool stands still: the robot's report jumped."
+        moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h is not best]  # NaN tells nothing
+        if best.name == "tool_slipped" and (moved_px > _MOVED_PX).all():
+            diagnosis = Diagnosis(tuple(others))
+        elif best.name == "camera_moved" and (best.value > _NEARER_PX + _TIMES * moved_px).all():
+            text = best.text.replace("Both cameras moved or zoomed", "Images and robot part")
+            text += " What lies behind the tool stands still: the robot's report jumped."
             jumped = replace(best, name="robot_jumped", text=text, cure="Calibrate before and after on their own.")
-            diagnosis = Diagnosis(tuple(jumped if h is best else h for h in diagnosis.hypotheses))
+            diagnosis = Diagnosis((jumped, *others))
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

@@ -90,6 +90,16 @@ def test_offsets_of_the_robots_landmarks_are_learnt(world, tmp_path):
     assert np.median(np.linalg.norm(without.project(np.arange(world.n))[0] - world.u, axis=-1)) > 2.0
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_robot_that_reports_another_opening_is_no_teacher(world, tmp_path, factor):
+    def half(_, x):
+        middle = x[:, 1:].mean(axis=1, keepdims=True)
+        return np.concatenate([x[:, :1], middle + factor * (x[:, 1:] - middle)], axis=1)
+
+    with pytest.raises(RefusalError, match="times as far apart"):
+        taught(world.record(tmp_path / "half", robot=half), StandIn(world.u, noise_px=0.7, wrong=0.3))
+
+
 def test_offsets_of_an_unknown_tool_do_not_hide_which_half_is_right(world, tmp_path):
     """They scatter the right ones so widely that no noise level tells them from the wrong ones."""
     from lib.calibration.offsets import tool_axes

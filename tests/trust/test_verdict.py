@@ -11,13 +11,13 @@ import pytest
 from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
-from lib.recordings import Doubt, Recording
+from lib.recordings import Doubt, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import LEVELS, Health, Reason, Verdict, assess, diagnose, judge
 from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
+from notebooks.studies import spoiling
 from notebooks.studies.simulated_rows import simulate_correspondences
-from notebooks.studies.spoiling import Scene
 
 CLOCK = Reason("clock", "not trustworthy", "183 ms", "Set offset_s.")
 FEW = Reason("few_frames", "doubtful", "5 frames", "Record more.")
@@ -54,6 +54,8 @@ def test_an_image_that_is_turned_against_the_other_is_named():
     data = made(40, 0)
     turned = replace(data, u_right=np.array([1919.0, 1079.0]) - data.u_right)
     assert names(data) == {} and names(turned) == {"turned_image": LEVELS[2]}
+    mirrored = replace(data, u_right=[1919.0, 0.0] + data.u_right * [-1.0, 1.0])
+    assert "turned_image" not in names(mirrored) and "mirrored" in names(mirrored)
 
 
 @pytest.mark.parametrize("n", [6, 8, 12, 40])
@@ -153,7 +155,7 @@ def test_careless_labels_are_looked_at_again_and_no_detector_is_taught():
 def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(monkeypatch):
     monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
     monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
-    scene = Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
+    scene = spoiling.Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
     centre = (np.array(scene.image_size_px) - 1) / 2
     far = [u - centre for u in (scene.data.u_left, scene.data.u_right)]
     left, right = (centre + d * (1 + 8e-8 * (d**2).sum(axis=1, keepdims=True)) for d in far)
@@ -179,3 +181,15 @@ def test_no_detection_is_one_message():
     assert [reason.name for reason in verdict.reasons] == ["no_detection"] and verdict.is_red
     with pytest.raises(NoDetectionError, match="the robot reports a position for 0 of the 60 landmarks"):
         calibrate(replace(data, x_mm=np.full((60, 3), np.nan)))
+
+
+def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(monkeypatch):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
+    late = data.frame >= len(recording) // 2
+    x_mm = data.x_mm + late[:, None] * np.array([0.5, 0.3, 0.2])
+    (reason,) = (r for r in assess(recording, replace(data, x_mm=x_mm)).verdict.reasons if r.name == "robot_jumped")
+    assert "Images and robot part at about frame 17" in reason.text and "moved" not in reason.text
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
+    names = [r.name for r in assess(recording, replace(data, x_mm=x_mm)).verdict.reasons]
+    assert "camera_moved" in names and "robot_jumped" not in names
