@@ -29,6 +29,7 @@ _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _NEARLY_SHUT, _OF_SHUT = 0.15, 3.0  # jaws that open less, of the tool's length, and by how much more noise these have
 _LEAST_PX = 0.02  # smaller residuals are rounding
+_TRIED = 6  # rounds of a fit that tells which frame is better
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
 _PARAMETERS = 21  # of two cameras with a distance, and about as many of the nine offsets as data tell
@@ -176,13 +177,14 @@ class Problem:
         @cache
         def parted(frame: int) -> Robust:
             columns = self.of_later_cameras(frame)
-            return self.fit(lambda M: columns, start=fit.start)
+            return self.fit(lambda M: columns, start=fit.start, rounds=_TRIED)
 
         cut, step = int(left.argmin()) + 2, max(frames // 5, 1)
         while step:
             best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
             step, cut = step if best != cut else step // 2, best
-        return cut, parted(cut)
+        columns = self.of_later_cameras(cut)
+        return cut, self.fit(lambda M: columns, start=parted(cut).start)
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
         """(..., n, 2, 2) px: what the cameras of a fit leave of the pixels at other positions x (..., n, 2, 3)."""
