@@ -62,8 +62,7 @@ def lens(case: Case) -> Iterator[Hypothesis]:
 
 def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     """What an affine camera absorbs: the jaws, and the optics in the fit of the best cause so far, are the witnesses."""
-    rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
-    A, covariance = sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
+    (A, covariance), (plain, of_plain) = (_of_axes(one, sign) for one in (fit, case.null))
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
@@ -71,9 +70,17 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     distance, spread = np.linalg.norm(fit.residuals, axis=2), case.problem.y[case.problem.used].std(axis=0).max()
     each = [np.quantile(own[rows], _FIT_SHARE) / spread for own, rows in zip(distance.T, case.problem.used.T, strict=True)]
     if (misfit := max(case.misfit(fit), *each)) < FITS:
-        yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
+        # Pixels cannot tell x from y; and where cameras fit without that cause, their pixels must be implausible, too.
+        told = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
+        yield from list(_jaws(case)) or (_scaled_axis(A, covariance) if told else ())
     if misfit < 2 * FITS:  # nor do they tell left from right
         yield from _handedness(case, A, covariance)
+
+
+def _of_axes(fit: Robust, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """A (2, 2, 3) of the cameras of a fit, and its covariance (12, 12)."""
+    rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
+    return sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
 
 
 def _constraints(A: np.ndarray) -> np.ndarray:
