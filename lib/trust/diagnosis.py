@@ -185,7 +185,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     for views in ((0, 1), (0,), (1,)):
         fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
-        size = float(np.sqrt((fit.moved_px[problem.frame >= frame][:, list(views)] ** 2).sum(axis=2).mean()))
+        late = problem.used[:, views] & (problem.frame >= frame)[:, None]
+        size = float(np.sqrt((fit.moved_px[:, views][late] ** 2).sum() / max(late.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."

@@ -162,14 +162,17 @@ class Problem:
         return late.reshape(len(self), 2, 2, -1)
 
     def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
-        """The frame from which on cameras of their own suit the rows best, and the fit with them, from a `fit` without."""
+        """The frame from which on cameras of their own suit the rows best, and the fit with them, from a `fit` without.
+
+        Weighted least squares of all cuts tell where to begin; fits of few rounds compare the frames around it.
+        """
         z = np.nan_to_num(np.concatenate([self.x, np.ones((len(self), 2, 1)), fit.residuals], axis=2))
         frames, scale = int(self.frame.max()) + 1, fit.shapes[0].scale
         weight = np.where(self.used, 1.0 / (scale**2 + scale * np.linalg.norm(fit.residuals, axis=2)), 0.0)
         moments, left = np.zeros((frames, 2, 6, 6)), 0.0
         np.add.at(moments, self.frame, np.einsum("nc,nci,ncj->ncij", weight, z, z))
         early = np.cumsum(moments, axis=0)[1:-2]
-        for part in (early, moments.sum(axis=0) - early):  # by least squares
+        for part in (early, moments.sum(axis=0) - early):  # what cameras of its own leave of it
             G = part[..., :4, :4] + 1e-9 * np.trace(part, axis1=2, axis2=3)[..., None, None] * np.eye(4) + 1e-12 * np.eye(4)
             open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
             left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
@@ -272,7 +275,7 @@ class Hypothesis:
     value: float
     sd: float
     unit: str
-    explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
+    explained: float  # share of the residuals' variance, 0 to 1, by likelihood; how sure or large where they do not show it
     gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
     images: tuple[int, ...] = (0, 1)  # left and right
     evidence: tuple[float, float, float, float] | None = None  # of the fit that the gain is of, as `_gain` takes it
