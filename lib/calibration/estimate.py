@@ -22,7 +22,7 @@ from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
 
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
-_OFFSET_ROWS = 24
+_OFFSET_ROWS = 12
 #: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.
 _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
 #: Axes turn unless their log likelihood is lower by more than this.
@@ -50,7 +50,7 @@ def calibrate(
         offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
             frames in which the robot reports three landmarks of open jaws, or in those of the landmarks where they are seen,
             if offsets turn these and explain the detections as well (`LandmarkOffsets.turns`); "image": in the images, for a
-            detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows
+            detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 12 rows
             and half of all allow it, else none.
         offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
         model: "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or
@@ -187,12 +187,13 @@ def _turned(
         own = tool_axes(x_mm, np.vstack([offset, np.zeros((3 - len(offset), 3))]))[row]
         return np.where(np.isfinite(own), own, axes)
 
-    offset = found.offsets.offset
-    turn_mm = np.einsum("nij,nj->ni", turned(offset) - axes, offset[data.landmark[usable]]).std()
-    if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or turn_mm < _LEAST_TURN_MM:
+    if found.offsets.p_value >= _SURE_OFFSETS and not sure:
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])
+        turn_mm = np.einsum("nij,nj->ni", turned(begin) - axes, begin[data.landmark[usable]]).std()
+        if turn_mm < _LEAST_TURN_MM:
+            return found
         with warnings.catch_warnings(action="ignore", category=Unsettled):
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
     except (DataError, np.linalg.LinAlgError):  # no cameras fit them

@@ -32,7 +32,7 @@ _MOST_MM, _MOST_ALONE_MM = 0.4, 0.25
 #: So many first steps use every detection; later ones drop those that fit another camera.
 _TAKEN = 4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
-_GRID_MM, _POLISHED, _STARTING_ROWS = (0.0, 0.2, -0.2), 8, 2000
+_GRID_MM, _POLISHED, _STARTING_ROWS, _REWEIGHTED = (0.0, 0.2, -0.2), 4, 2000, 3
 
 
 class Unsettled(RuntimeWarning):
@@ -217,12 +217,13 @@ def _steps(
     for i in range(iterations):
         if i < taken:
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
+        before_px = found.reprojection_rms_px if i else np.inf
         found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
-        views = found.view_inliers if i >= taken + 2 else None  # outliers that come and go from step to step would be no end
+        # Outliers that come and go from step to step would be no end; where other axes of rows were chosen they are new.
+        views = found.view_inliers if i >= taken + 2 and found.reprojection_rms_px < 1.2 * before_px else None
         rows = found.inliers
         J_x, J_c, weight, r = found.system
-        steps = _STEP * np.eye(offset.size).reshape(-1, *offset.shape)  # of a central difference, since axes turn
-        J = np.stack([shift(offset + one) - shift(offset - one) for one in steps], axis=2)[rows] / (2 * _STEP)
+        J = _by_offset(axes, offset, landmark)[rows]
         J = J if axes is None else J_x @ J
         information, gradient = _without_cameras(J, J_c, weight, r)
         if np.isnan(p_value):
@@ -262,37 +263,70 @@ def start_of_turning(
     """Offsets (k, 3) from which to estimate those that turn the axes; of many starts the one that explains most.
 
     Offsets turn the axes by three numbers: where the tips' middle lies beside the shaft, in two directions, and their
-    heights.  From each point of a grid of them the offsets follow linearly, and the best improve as they turn the axes anew.
-    `found` is the calibration by the reported `axes` (n, 3, 3), `turned` gives the axes of offsets.
+    heights.  From each point of a grid of them goes a Gauss-Newton step, and from the best go more.  `found` is the
+    calibration by the reported `axes` (n, 3, 3), `turned` gives the axes of offsets.
     """
     some = np.random.default_rng(0).permutation(found.inliers.sum())[:_STARTING_ROWS]  # every third would be one landmark
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
     r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]
-    chosen = np.eye(k)[landmark[rows]]
     prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
 
-    def explained(offset: np.ndarray) -> tuple[float, np.ndarray]:
-        """How much better than none offsets explain the detections, and the best ones if the axes stayed."""
-        J = np.einsum("nia,nk->nika", J_x @ turned(offset)[rows], chosen).reshape(len(r), -1, 3 * k)
-        information, gradient = _without_cameras(J, J_c, weight, r)
-        information, d = information + prior, offset.ravel()
-        return float(2 * gradient @ d - d @ information @ d), np.linalg.solve(information, gradient).reshape(offset.shape)
+    def of_rows(offset: np.ndarray) -> np.ndarray:
+        return turned(offset)[rows]
+
+    def from_here(offset: np.ndarray) -> tuple[float, np.ndarray]:
+        """How badly offsets explain the detections, with the cameras free, and where a Gauss-Newton step leads.
+
+        Rows whose axes stay wrong are far off, and count little: the noise is Student's, of 4 degrees of freedom.
+        """
+        left = r - (J_x @ of_rows(offset) @ offset[landmark[rows]][:, :, None])[:, :, 0]
+        J, p, w = np.concatenate([J_c, J_x @ _by_offset(of_rows, offset, landmark[rows])], axis=2), J_c.shape[2], weight
+        for _ in range(_REWEIGHTED):
+            weighted = (w @ J).reshape(-1, J.shape[2])
+            information, gradient = weighted.T @ J.reshape(weighted.shape), weighted.T @ left.ravel()
+            rest = left - J_c @ np.linalg.solve(information[:p, :p], gradient[:p])
+            r2 = (rest[:, None] @ weight @ rest[:, :, None])[:, 0, 0]
+            w = weight / (1 + r2 / np.median(r2))[:, None, None]
+        information[p:, p:] += prior
+        step = np.linalg.solve(information, gradient - np.append(np.zeros(p), prior @ offset.ravel()))[p:]
+        cost = len(r) * np.log(np.median(r2)) + 2 * np.log1p(r2 / np.median(r2)).sum()
+        return float(cost), offset + step.reshape(offset.shape)
 
     starts = []
-    for beside, above, apart in product(_GRID_MM, repeat=3):
-        turn = np.array([[0.0, 0.0, 0.0], [0.0, beside, above - apart / 2], [0.0, beside, above + apart / 2]])[:k]
-        offset = explained(turn)[1]
-        starts.append((*explained(offset), offset))
-    best = max(starts, key=lambda start: start[0])
-    for start in sorted(starts, key=lambda start: -start[0])[:_POLISHED]:
-        share = 0.7
+    for turn in product(_GRID_MM, repeat=3):
+        offset = from_here(np.tensordot(turn, _turns(k)[1], 1))[1]
+        starts.append((*from_here(offset), offset))
+    best = min(starts, key=lambda start: start[0])
+    for start in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
+        share = 1.0
         for _ in range(6):
             offset = start[2] + share * (start[1] - start[2])
-            new = (*explained(offset), offset)
-            start, share = (new, share) if new[0] > start[0] else (start, share / 2)
-        best = max(best, start, key=lambda start: start[0])
+            new = (*from_here(offset), offset)
+            start, share = (new, 1.0) if new[0] < start[0] else (start, share / 2)
+        best = min(best, start, key=lambda start: start[0])
     return best[2]
+
+
+def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The three numbers of offsets (k, 3) that turn the axes, as rows (3, 3 k), and offsets (3, k, 3) of one of each.
+
+    They are where the tips' middle lies beside and above the base, and by how much tip_2 lies above tip_1.
+    """
+    rows = [[0, -1, 0, 0, 0.5, 0, 0, 0.5, 0], [0, 0, -1, 0, 0, 0.5, 0, 0, 0.5], [0, 0, 0, 0, 0, -1, 0, 0, 1]]
+    rows = np.array(rows)[:, : 3 * k]
+    return rows, np.linalg.pinv(rows).T.reshape(3, k, 3)
+
+
+def _by_offset(axes: Callable[[np.ndarray], np.ndarray] | None, offset: np.ndarray, landmark: np.ndarray) -> np.ndarray:
+    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes, too."""
+    k, m = offset.shape
+    own = np.eye(m)[None].repeat(len(landmark), axis=0) if axes is None else axes(offset)
+    J = np.einsum("nij,nk->nikj", own, np.eye(k)[landmark]).reshape(-1, m, k * m)
+    for turn, along in zip(*_turns(k), strict=True) if axes is not None else ():
+        turning = (axes(offset + _STEP * along) - axes(offset - _STEP * along)) / (2 * _STEP)
+        J = J + np.einsum("nij,nj->ni", turning, offset[landmark])[:, :, None] * turn
+    return J
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

@@ -182,7 +182,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
     text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
-    more = " With more frames, constant offsets of the landmarks may be estimated, too." * (c.offsets is None)
+    more = " From four frames of open jaws on, constant offsets of the landmarks are estimated, too." * (c.offsets is None)
     yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector.{more}"
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
@@ -274,10 +274,14 @@ def assess(
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
         options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows.
+
+    A ValueError for data of frames that the recording lacks.
     """
     if data is None:
         detector = detector or Detector.load()
         data = detect(recording, detector)
+    if (last := data.frame.max(initial=0)) >= len(recording):
+        raise ValueError(f"data: frame {last} is none of the {len(recording)} of {recording.folder}; is it of this recording?")
     calibration, error, epipolar_px = None, None, np.nan
     try:
         fit = calibrate if "model" in options else calibrate_as_shown

@@ -11,7 +11,7 @@ from lib.calibration import CompetingCamerasError, calibrate, estimate, with_off
 from lib.calibration.offsets import Unsettled, carried, estimate_offsets, start_of_turning, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
-from lib.simulator.rig import IMAGE_SIZE_PX
+from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
 from tests.calibration.rigs import LANDMARKS_MM, OFFSETS_MM, tool_sweep
 
 
@@ -96,6 +96,41 @@ def test_offsets_as_large_as_a_fifth_of_the_tool_are_found_from_far_off(seed):
     found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
     apart = found.offsets.offset - offset
     assert found.offsets.turns and np.abs(apart - apart.mean(axis=0)).max() < 0.015
+
+
+@pytest.mark.parametrize(("seed", "turn_rad"), [(0, 0.05), (3, 0.05), (8, 0.1)])
+def test_offsets_of_jaws_that_shut_are_found_where_the_tool_hardly_turns(seed, turn_rad):
+    """By the reported axes the tips' heights seem to be none: only as they turn the axes of shut jaws do they show."""
+    rng, (data, rig, _) = np.random.default_rng(seed), tool_sweep(seed, frames=24, turn_rad=turn_rad)
+    x, offset = data.grid("x_mm"), np.array([[0.08, -0.1, -0.02], [0.0, 0.01, -0.18], [0.02, 0.07, 0.11]])
+    half = x[:, 2] - x[:, 1]
+    width_mm = np.interp(np.arange(24), [0, 8, 16, 24], [2.0, 1.8, 0.4, 0.4])
+    half *= (width_mm / np.linalg.norm(half, axis=1) / 2)[:, None]
+    x[:, 1:] = x[:, 1:].mean(axis=1, keepdims=True) + np.stack([-half, half], axis=1)
+    reported = x - np.einsum("nij,kj->nki", tool_axes(x), offset) + rng.normal(0, 0.005, x.shape)
+    u = [p + rng.normal(0, 0.5, p.shape) for p in rig.project(x.reshape(-1, 3))]
+    found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
+    apart = found.offsets.offset - offset
+    assert found.offsets.turns and np.abs(apart - apart.mean(axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize("frames", [4, 5, 6])
+def test_offsets_of_few_frames_are_estimated_and_none_are_invented(frames):
+    """Cameras of four to six frames are three times as good where landmarks are off, and as good where they are not."""
+    corners = ROBOT_FROM_MICROSCOPE.apply(np.stack(np.meshgrid([-6, 6], [-3, 3], [-1.5, 1.5]), axis=-1).reshape(-1, 3))
+
+    def error_px(size, options):
+        errors = []
+        for seed in range(6):
+            offset = np.random.default_rng(seed).normal(0, size, (3, 3))
+            data, rig, _ = tool_sweep(seed, frames=frames, offset_mm=offset)
+            found = calibrate(data, **options)
+            apart = np.hstack([a - b for a, b in zip(found.rig.project(corners), rig.project(corners), strict=True)])
+            errors.append(np.median(np.abs(apart - np.median(apart, axis=0))))
+        return np.median(errors)
+
+    assert error_px(0.1, {}) < error_px(0.1, {"offsets": False}) / 3
+    assert error_px(0.0, {}) < 1.1 * error_px(0.0, {"offsets": False})
 
 
 def test_some_rows_of_all_landmarks_tell_where_turning_offsets_start(monkeypatch):

@@ -183,6 +183,12 @@ def test_no_detection_is_one_message():
         calibrate(replace(data, x_mm=np.full((60, 3), np.nan)))
 
 
+def test_data_of_frames_that_the_recording_lacks_are_refused():
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    with pytest.raises(ValueError, match=r"data: frame 59 is none of the 34 of .*open_sky_eye"):
+        assess(recording, made(60))
+
+
 def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(monkeypatch):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
