@@ -40,8 +40,9 @@ _HARMLESS = 0.01
 #: Share of the frames in which the images may show the whole tool elsewhere than the robot.
 _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
-#: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
-_OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
+#: has no edge that ends along the shaft: there its error is so many times the deviation that the detector states, if that
+#: is more.  Chosen by four recordings of unfamiliar tools and lights, and for the base by ten of two other renderers.
+_OWN_BIAS, _BASE_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]), 3.0
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
 #: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm, however short the tool.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
@@ -208,7 +209,8 @@ def teach(
         if fault is not None and not (alone or clicked):
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector takes other points for the tips. {_LABEL}")
         turns = told.turns
-        offset, covariance = _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
+        own = 0.2 * _OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
+        offset, covariance = _robots_share(told, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
@@ -240,6 +242,15 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
     with suppress(*_POOR):
         return _placed(recording, opinion.of(frames)).offsets
     return None
+
+
+def _own_bias(seen: Seen) -> np.ndarray:
+    """`_OWN_BIAS` (3, 3) of a detector that is as sure of the base as it says."""
+    along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
+    stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
+    own = _OWN_BIAS.copy()
+    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
+    return own
 
 
 def _length_mm(recording: Recording) -> float:

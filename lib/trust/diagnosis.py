@@ -29,6 +29,7 @@ _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, whi
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
+_UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
 _STILL_PX = 0.3  # detections of one picture differ by less
 
 
@@ -273,17 +274,22 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     if not np.isfinite(reach).any():
         return []
     length, distance = np.nanmedian(reach), np.linalg.norm(fit.residuals, axis=2)
-    missed = float(np.median(distance[problem.used]))
+    far = problem.used & (distance > 0.05 * length)
+    share = float(far.sum() / problem.used.sum())
+    off = far if share >= _UNFIT_SHARE else problem.used
+    missed = float(np.median(distance[off]))
     zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
-    distances = affine_epipolar(problem.y[problem.used.all(axis=1)].reshape(-1, 4))[0]  # NaN of few, which is no witness
-    epipolar, half = float(np.sqrt(2.0) * np.median(distances)), problem.used.sum() / 2.0
+    both = problem.used.all(axis=1)
+    distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # NaN of few, which is no witness
+    epipolar, half = float(np.sqrt(2.0) * np.median(distances[off[both].any(axis=1)])), problem.used.sum() / 2.0
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
-        text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
+        what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
+        text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
         cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
-        explained = 1.0 - (epipolar / missed) ** 2
-        gain = half * float(np.log(missed / epipolar)) / fit.design
+        explained = (share if off is far else 1.0) * (1.0 - (epipolar / missed) ** 2)
+        gain = off.sum() / 2.0 * float(np.log(missed / epipolar)) / fit.design
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
-    if (share := float((distance[problem.used] > 0.05 * length).mean())) < 0.2:
+    if off is not far:
         return []
     gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
@@ -348,8 +354,8 @@ def diagnose(
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, _rigid_tips]
-    found = [h for test in tests for h in test(whole if test is _frozen else case) if np.isfinite(h.gain)]
-    best = Diagnosis(found := compared(found)).best
+    found = compared([h for test in tests for h in test(whole if test is _frozen else case)])
+    best = Diagnosis(found := [h for h in found if np.isfinite(h.gain)]).best
     if best is None:  # other faults look like offsets, too
         found += _landmark_offset(case)
         best = Diagnosis(found).best

@@ -369,10 +369,13 @@ class Case:
 
 
 def compared(found: list[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs."""
-    least = min((h.evidence[3] for h in found if h.is_named), default=1.0)
-    own = (max(_gain(*h.evidence[:3], least), 0) - max(_gain(*h.evidence), 0) if h.is_named else 0 for h in found)
-    return [replace(h, gain=h.gain + more) for h, more in zip(found, own, strict=True)]
+    """Hypotheses whose gains can be compared: rows count by one design for all, the least of those that are named.
+
+    What leaves little may leave it in stretches, by which its own rows would hardly count.
+    """
+    least = min((h.evidence[3] for h in found if h.is_named), default=np.inf)
+    gains = (max(_gain(*h.evidence[:3], min(least, h.evidence[3])), 0.0) - max(_gain(*h.evidence), 0.0) for h in found)
+    return [replace(h, gain=max(h.gain, 0.0) + more if more else h.gain) for h, more in zip(found, gains, strict=True)]
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:

@@ -30,6 +30,8 @@ LIMITS = {
 }
 #: Parts that are of a frame: they tell no wrong landmark.
 _OF_FRAMES = ("shape", "unfamiliar")
+#: Parts that take the robot's report for right.
+BY_ROBOT = ("robot", "smoothness", "shape")
 #: Medians and standard deviations of `looks` over 288 pictures of the training population.
 _FAMILIAR = np.array([
     [0.32, -0.23, -2.49, -2.54, -0.76, -1.80, -3.38, -2.91, -2.76], [0.32, 0.31, 0.82, 0.82, 0.47, 0.52, 0.66, 0.60, 0.59],
