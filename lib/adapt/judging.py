@@ -60,8 +60,7 @@ class Agreement:
 
 def frame_means(share: np.ndarray) -> np.ndarray:
     """(m,) means over the landmarks of (m, ...) shares of the tool's length, each at most a tenth; NaN does not count."""
-    share = np.minimum(share, _CAP).reshape(len(share), -1)
-    return np.ma.masked_invalid(share).mean(axis=1).filled(np.nan)
+    return np.ma.masked_invalid(np.minimum(share, _CAP).reshape(len(share), -1)).mean(axis=1).filled(np.nan)
 
 
 def agreement(teacher: Teacher, seen: Seen) -> Agreement:

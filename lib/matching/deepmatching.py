@@ -53,8 +53,7 @@ def pool(maps: torch.Tensor, start: int = 0) -> torch.Tensor:
     pooled, beside = maps[:, :, start : maps.shape[2] - start : 2].clone(), maps[:, :, 1 - start :: 2]
     for before, after in ((0, start), (1 - start, 0)):  # whole rows are far quicker than max_pool2d
         rows = beside[:, :, after : after + pooled.shape[2] - before]
-        into = pooled[:, :, before : before + rows.shape[2]]
-        torch.maximum(into, rows, out=into)
+        torch.maximum(into := pooled[:, :, before : before + rows.shape[2]], rows, out=into)
     return max_pool1d(pooled.flatten(0, 2), 3, stride=2, padding=1).reshape(*pooled.shape[:3], -1)
 
 

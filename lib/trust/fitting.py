@@ -43,17 +43,18 @@ class Shape:
     freedom: float
 
     @classmethod
-    def of(cls, r2: np.ndarray, start: float, least: float, before: float | None = None) -> Self:
-        """Most probable for squared residuals (k,), with `least` degrees of freedom or more, not far from those `before`."""
+    def of(cls, r2: np.ndarray, least: float, before: Self | None = None) -> tuple[Self, float]:
+        """Most probable for squared residuals (k,), of `least` freedom or more, near that `before`; its log likelihood."""
         tried = _FREEDOM[least <= _FREEDOM]
-        if before is not None:
-            tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
-        freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
+        if before:
+            tried = tried[np.abs(np.arange(len(tried)) - tried.searchsorted(before.freedom)) <= 1]
+        freedom, share = tried[:, None], (tried[:, None] + 2.0) / (2.0 * len(r2))
+        s2 = np.full(freedom.shape, before.scale if before else max(np.sqrt(np.median(r2)), _LEAST_PX)) ** 2
         for _ in range(4):
-            weighted = s2 * (r2 / (freedom * s2 + r2)).sum(axis=1, keepdims=True)
-            s2 = np.maximum((freedom + 2.0) / (2.0 * len(r2)) * weighted, _LEAST_PX**2)
-        best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
-        return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
+            s2 = np.maximum(share * (s2 * (r2 / (freedom * s2 + r2)).sum(axis=1, keepdims=True)), _LEAST_PX**2)
+        likelihood = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1)
+        best = likelihood.argmax()
+        return cls(float(np.sqrt(s2[best, 0])), float(freedom[best, 0])), float(likelihood[best])
 
     def log_density(self, r2: np.ndarray) -> np.ndarray:
         """Of squared residuals.
@@ -136,12 +137,12 @@ class Problem:
         return self.seen & np.isfinite(self.x).all(axis=2)
 
     def fit(
-        self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
+        self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
         """Most probable cameras, offsets and additions, near a `Robust.start` or the best sample of four rows.
 
-        `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) have another noise.
+        `columns` (n, 2, 2, k) (or cameras M -> columns): what each addition does to pixels; rows `apart` have another noise.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:  # of least squares, or of the samples of four rows that most rows are near to
@@ -179,15 +180,13 @@ class Problem:
 
         @cache
         def parted(frame: int) -> Robust:
-            columns = self.of_later_cameras(frame)
-            return self.fit(lambda M: columns, start=fit.start, rounds=_TRIED)
+            return self.fit(self.of_later_cameras(frame), start=fit.start, rounds=_TRIED)
 
         cut, step = int(left.argmin()) + 2, max(frames // 5, 1)
         while step:
             best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
             step, cut = step if best != cut else step // 2, best
-        columns = self.of_later_cameras(cut)
-        return cut, self.fit(lambda M: columns, start=parted(cut).start)
+        return cut, self.fit(self.of_later_cameras(cut), start=parted(cut).start)
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
         """(..., n, 2, 2) px: what the cameras of a fit leave of the pixels at other positions x (..., n, 2, 3)."""
@@ -200,50 +199,53 @@ class Problem:
         H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2))
 
-    def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
-        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
-        x = np.where(self.used[:, :, None], self.x, 0.0)
-        image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 3)
-        own = np.where(self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3)), 1.0, 0.0)  # (n, 2, 3)
-        of_offsets = np.einsum("ncij,nck->ncikj", image, own).reshape(len(self), 2, 2, 9)
-        of_cameras = self.of_cameras.reshape(len(self), 2, 2, 16)
-        seen = (of_cameras.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
-        parts = [of_cameras, of_offsets, _shrinking(M, x, seen - self.centre_px)[..., None]]
-        parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
-        return np.concatenate(parts, axis=3)
+    @cached_property
+    def _of_offsets(self) -> np.ndarray:
+        """(2, 3, n * 9): derivatives of the positions by the offsets, 0 in images that are not used."""
+        own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
+        return np.einsum("nij,nck->cinkj", self.axes, own).reshape(2, 3, -1)
 
-    def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
+    def _design(self, M: np.ndarray, columns: np.ndarray | Callable | None) -> np.ndarray:
+        """(n * 4, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
+        of_offsets = (M[:, :, :3] @ self._of_offsets).reshape(2, 2, -1, 9).transpose(2, 0, 1, 3)
+        of_cameras, used = self.of_cameras.reshape(-1, 16), self.used[:, :, None]
+        shrinking = _shrinking(M, self.x, (of_cameras @ M.ravel()).reshape(self.y.shape) - self.centre_px)
+        parts = [of_cameras.reshape(*self.y.shape, 16), of_offsets, np.where(used, shrinking, 0.0)[..., None]]
+        parts += [] if columns is None else [np.nan_to_num(columns(M) if callable(columns) else columns) * used[..., None]]
+        return np.concatenate(parts, axis=3).reshape(self.y.size, -1)
+
+    def _descend(self, beta: np.ndarray, columns: np.ndarray | Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
         M = beta[:16].reshape(2, 2, 4)
-        extra = 0 if columns is None else columns(M).shape[3]
-        prior = np.diag(np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2, 0.0], [16, 9, 1, extra]))
-        r = y - (self._design(M, None).reshape(-1, 26) @ beta).reshape(y.shape)
+        D = self._design(M, columns)
+        prior = np.diag(np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2, 0.0], [16, 9, 1, D.shape[1] - 26]))
+        r = y - (D[:, :26] @ beta).reshape(y.shape)
         r2 = (r**2).sum(axis=2) / self.noise**2
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
-        rich = 2 * used.sum() / (_PARAMETERS + extra)
+        rich = 2 * used.sum() / (_PARAMETERS + D.shape[1] - 26)
         least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
-        shapes = [Shape.of(r2[rows], max(float(np.sqrt(np.median(r2[rows]))), _LEAST_PX), least) for rows in groups]
+        found = [Shape.of(r2[rows], least) for rows in groups]
         before, of_noise = -np.inf, -2.0 * np.log(self.noise[used]).sum()
-        for _ in range(rounds):
+        for done in range(rounds):
+            D = self._design(M, columns) if done else D
             weight = np.zeros(used.shape)
-            for rows, shape in zip(groups, shapes, strict=True):
+            for rows, (shape, _) in zip(groups, found, strict=True):
                 weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
-            D, root = self._design(M, columns).reshape(y.size, -1), (np.sqrt(weight) / self.noise)[:, :, None]
-            J = D * np.broadcast_to(root, y.shape).reshape(-1, 1)
+            root = (np.sqrt(weight) / self.noise)[:, :, None]
+            J = D * np.repeat(root, 2)[:, None]
             information = J.T @ J + prior
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
             M, r = beta[:16].reshape(2, 2, 4), y - (D @ beta).reshape(y.shape)
             r2 = (r**2).sum(axis=2) / self.noise**2
-            shapes = [Shape.of(r2[rows], old.scale, least, old.freedom) for rows, old in zip(groups, shapes, strict=True)]
-            likelihood = sum(shape.log_density(r2[rows]).sum() for rows, shape in zip(groups, shapes, strict=True))
-            total = float(of_noise + likelihood - 0.5 * beta @ prior @ beta)
+            found = [Shape.of(r2[rows], least, old) for rows, (old, _) in zip(groups, found, strict=True)]
+            total = float(of_noise + sum(likelihood for _, likelihood in found) - 0.5 * beta @ prior @ beta)
             if abs(total - before) < 0.02:
                 break
             before = total
-        design = self._overcount(r * root)
+        shapes, design = [shape for shape, _ in found], self._overcount(r * root)
         told = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # by so much this exceeds Fisher's information
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design * told
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
@@ -261,8 +263,8 @@ class Problem:
 def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
     """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels `from_centre` of the image, of positions x (..., n, 2, 3)."""
     normal = cross(M[:, 0, :3], M[:, 1, :3])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return -np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre
+    normal /= np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-12)
+    return -(x * normal).sum(axis=-1, keepdims=True) * from_centre
 
 
 @dataclass(frozen=True)
@@ -349,7 +351,7 @@ class Case:
 
     def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None) -> Robust:
         """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns)."""
-        return (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.start)
+        return (on or self.problem).fit(columns, start=self.null.start)
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
