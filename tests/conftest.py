@@ -24,7 +24,7 @@ LONGEST = (
     "test_notebooks.py", "test_notebooks_course.py", "test_commands.py", "trust/test_diagnosis.py",
     "workbench/test_run.py", "online/test_pipeline.py", "simulator/test_dataset.py", "calibration/test_estimate.py",
     "surface/test_reconstruct.py", "calibration/test_offsets.py", "matching/test_match.py",
-    "importing/test_import.py", "surface/test_fitting.py", "calibration/test_robust.py",
+    "importing/test_import.py", "matching/test_stereo_pairs.py", "surface/test_fitting.py", "calibration/test_robust.py",
     "simulator/test_geometry_of_images.py", "simulator/test_population.py", "studies/test_calibration.py",
     "registration/test_registration.py", "training/test_command.py", "calibration/test_instruments.py",
     "trust/test_check.py", "workbench/test_sweep.py", "online/test_beside.py", "landmarks/test_detector.py",

@@ -183,10 +183,18 @@ class Scenery(World):
         return replace(found, u=found.u + self.tool_px)
 
 
+@cache
+def scenery():
+    """A pipeline that saw 40 frames of a ground that stands still."""
+    world = Scenery(5, NOISE_PX)
+    run(pipeline := make(world, settings=SELDOM), world, 40)
+    return world, pipeline
+
+
 def test_a_scene_that_stands_still_contradicts_a_motion():
     """The detector sees another place of the tool: the rig is kept, as long as that lasts."""
-    world = Scenery(5, NOISE_PX)
-    before = deepcopy(run(pipeline := make(world, settings=SELDOM), world, 40)[-1].rig)
+    world, pipeline = deepcopy(scenery())
+    before = deepcopy(pipeline.rig)
     world.tool_px = np.array([16.0, -12.0])
     results = run(pipeline, world, 25)
     assert not any(r.motion for r in results) and not any(measured(results))
@@ -198,8 +206,7 @@ def test_a_scene_that_stands_still_contradicts_a_motion():
 
 
 def test_a_scene_that_moves_too_agrees_with_a_motion():
-    world = Scenery(5, NOISE_PX)
-    run(pipeline := make(world, settings=SELDOM), world, 40)
+    world, pipeline = deepcopy(scenery())
     world.tool_px, world.ground_px = np.array([16.0, -12.0]), np.array([16, -12])
     results = run(pipeline, world, 12)
     assert any(r.motion for r in results[:4]) and results[-1].state == "tracking"
