@@ -306,17 +306,16 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
     score = path_scores(pooled.pow_(POWER), n_levels(gy, gx), shifted=True)
     best, place = score.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=score.device)
-    ratio, strongest = np.empty((gy, gx)), score.new_full((n_y, n_x), -torch.inf)
+    ratio, strongest = np.empty((gy, gx)), score.new_full((n_y * n_x,), -torch.inf)
     for part, maps in chunks():
-        small = pool(maps)
+        small, highest = max_pool2d(maps, 3, stride=2, padding=1, return_indices=True)
         best[part], peak = score[part].flatten(2).max(dim=2)
         row, column = torch.div(peak, small.shape[3], rounding_mode="floor"), peak % small.shape[3]
-        full = unpool(maps, score[part])
-        place[part] = full.flatten(2).argmax(dim=2)
-        strongest = torch.maximum(strongest, full.amax(dim=(0, 1)))
+        place[part] = highest.flatten(2).gather(2, peak[:, :, None])[:, :, 0]
+        strongest.scatter_reduce_(0, highest.flatten(), score[part].flatten(), "amax")
         ratio[part] = peak_ratio(small.flatten(0, 1), row.flatten(), column.flatten()).reshape(peak.shape)
     x, y = place % n_x, torch.div(place, n_x, rounding_mode="floor")
-    bins = max_pool2d(strongest[None], PATCH, ceil_mode=True)[0]
+    bins = max_pool2d(strongest.view(1, n_y, n_x), PATCH, ceil_mode=True)[0]
     own = bins[torch.div(y, PATCH, rounding_mode="floor"), torch.div(x, PATCH, rounding_mode="floor")]
     return torch.stack([x, y], dim=2), best, ratio, best >= own
 
