@@ -156,7 +156,8 @@ def _behind_its_jaw(nodes: Nodes, k: int, u: np.ndarray, zoom: float) -> bool:
     if raster is not None:
         covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
     sample = (np.arange(side * factor) + 0.5) / factor - 0.5
-    return covered[np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2].all()
+    near = np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2
+    return covered[near].all()
 
 
 def compose(
