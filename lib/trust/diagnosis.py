@@ -279,19 +279,19 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     off = far if share >= _UNFIT_SHARE else problem.used
     missed = float(np.median(distance[off]))
     zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
-    both = problem.used.all(axis=1)
+    both, half = problem.used.all(axis=1), problem.used.sum() / 2.0
     distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # NaN of few, which is no witness
-    epipolar, half = float(np.sqrt(2.0) * np.median(distances[off[both].any(axis=1)])), problem.used.sum() / 2.0
+    epipolar = float(np.sqrt(2.0) * np.quantile(distances[off[both].any(axis=1)], 0.75 if off is far else 0.5))
+    gain = half * (share * np.log(max(share, 1e-9) / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
-        text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
+        text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px."
         cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
         explained = (share if off is far else 1.0) * (1.0 - (epipolar / missed) ** 2)
-        gain = off.sum() / 2.0 * float(np.log(missed / epipolar)) / fit.design
+        gain = float(gain if off is far else half * np.log(missed / epipolar) / fit.design)
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
     if off is not far:
         return []
-    gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
 

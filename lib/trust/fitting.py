@@ -373,11 +373,14 @@ class Case:
 def compared(found: list[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses whose gains can be compared: rows count by one design for all, the least of those that are named.
 
-    What leaves little may leave it in stretches, by which its own rows would hardly count.
+    A cause of one or two numbers that leaves little may leave it in stretches, by which its own rows would hardly count.
     """
-    least = min((h.evidence[3] for h in found if h.is_named), default=np.inf)
-    gains = (max(_gain(*h.evidence[:3], min(least, h.evidence[3])), 0.0) - max(_gain(*h.evidence), 0.0) for h in found)
-    return [replace(h, gain=max(h.gain, 0.0) + more if more else h.gain) for h, more in zip(found, gains, strict=True)]
+    least, gains = min((h.evidence[3] for h in found if h.is_named), default=np.inf), []
+    for h in found:
+        design = min(least, h.evidence[3]) if h.is_named or h.evidence[2] <= 2 else h.evidence[3]
+        more = max(_gain(*h.evidence[:3], design), 0.0) - max(_gain(*h.evidence), 0.0)
+        gains.append(max(h.gain, 0.0) + more if more else h.gain)
+    return [replace(h, gain=gain) for h, gain in zip(found, gains, strict=True)]
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:
