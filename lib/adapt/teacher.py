@@ -41,8 +41,8 @@ _HARMLESS = 0.01
 _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft: there its error is so many times the deviation that the detector states, if that
-#: is more.  Chosen by four recordings of unfamiliar tools and lights, and for the base by ten of two other renderers.
-_OWN_BIAS, _BASE_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]), 3.0
+#: is more.  Chosen by recordings of unfamiliar tools and lights, and that of the base by ten of two other renderers as well.
+_OWN_BIAS, _BASE_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]), 2.0
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
 #: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm, however short the tool.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25

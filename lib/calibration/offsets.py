@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
-from lib.calibration.robust import CompetingCamerasError
+from lib.calibration.robust import NoConsensusError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import cross
@@ -168,8 +168,8 @@ def estimate_offsets(
     pixels (n, m) with the `views` to use, and one Schur complement; an `Unsettled` warning where `iterations` are too few.
     `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
     prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
-    Where two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may explain it; else the
-    `CompetingCamerasError`, or the calibration without that landmark, stays.
+    Where no cameras agree or two compete, or one landmark hardly agrees with the others' cameras, small offsets may explain
+    it; else the `NoConsensusError`, or the calibration without that landmark, stays.
     """
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
@@ -177,7 +177,7 @@ def estimate_offsets(
     found, competing = None, None
     try:
         found = steps()
-    except CompetingCamerasError as error:
+    except NoConsensusError as error:
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found
@@ -209,7 +209,7 @@ def _steps(
     p_value, views = np.nan, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
-    step, share = np.zeros(offset.size), 1.0
+    step, share, before_px = np.zeros(offset.size), 1.0, np.inf
 
     def shift(offset: np.ndarray) -> np.ndarray:
         return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
@@ -217,10 +217,10 @@ def _steps(
     for i in range(iterations):
         if i < taken:
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
-        before_px = found.reprojection_rms_px if i else np.inf
         found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
         # Outliers that come and go from step to step would be no end; where other axes of rows were chosen they are new.
         views = found.view_inliers if i >= taken + 2 and found.reprojection_rms_px < 1.2 * before_px else None
+        before_px = found.reprojection_rms_px
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         J = _by_offset(axes, offset, landmark)[rows]

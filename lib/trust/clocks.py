@@ -36,7 +36,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
             text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {size}."
             cure = f"Add {value:.4f} to offset_s in recording.toml; estimate_time_offset checks it."
         else:
-            text = f"The {SIDES[views[0]]} camera alone shows the tool {size} later than the frame's time."
+            text = f"The {SIDES[views[0]]} camera alone shows the tool {size} after the frame's time (negative: before)."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({size})."
         yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
@@ -127,7 +127,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
 
 def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
     """Images in the order of their names as text (0, 1, 10, 11, ..., 2), counted from 0 or from 1."""
-    if case.misfit(case.null, *case.fits.values()) < FITS:
+    if case.misfit(case.null) < FITS:
         return
     starts = np.nanmin(case.by_frame(case.problem.time), axis=1)
     for first, views in product((0, 1), ((0, 1), (0,), (1,))):
@@ -140,10 +140,23 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
             continue
         fit = moved.fit()
         what = "images" if len(views) == 2 else f"{SIDES[views[0]]} images"
-        text = f"The {what} stand in the order of their names as text: {first}, {first + 1}, 10, 11, ... before {first + 2}."
+        text = f"The {what} are sorted by their names as text: {first}, {first + 1}, 10, 11, ... before {first + 2}."
         cure = "Sort them by number, or give the names leading zeros: 000, 001, 002, ..."
         share = 100.0 * float((number != np.arange(case.frames)).mean())
         yield case.found("frame_order", fit, 1, (share, 0.0, "%"), text, cure, on=moved, images=views)
+
+
+def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
+    """A log that is a moving average: it cuts corners, by the acceleration times the square of its window over 24."""
+    acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
+    known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
+    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
+    value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
+    if value > 3 * sd:
+        text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: that cuts corners, shrinks all motion."
+        cure = "Log the positions as they are measured, without a filter."
+        size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
+        yield case.found("smoothed_log", fit, 1, size, text, cure, on=known)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:
@@ -170,4 +183,4 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
 
 
 #: They need the tool's path in time (`Case.paths`).
-TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _readout)
+TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _smoothed_log, _readout)

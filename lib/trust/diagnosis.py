@@ -29,6 +29,7 @@ _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, whi
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
+_BENDS = 1.5  # standard deviations that the detector states of the base, below which it moves as tips of a bent tool do
 _UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
 _STILL_PX = 0.3  # detections of one picture differ by less
 
@@ -80,6 +81,8 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
         x = case.problem.x * tips[:, None, None]
         fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
+        if size < _BENDS * case.problem.noise_px * np.median(case.problem.noise[~tips]):
+            return  # the detector knows the base no better
         text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
         yield case.found("tool_bends", fit, 9, (size, 0.0, "px"), text, cure)

@@ -94,6 +94,7 @@ class Problem:
     y: np.ndarray  # (n, 2, 2) px
     seen: np.ndarray  # (n, 2) bool
     noise: np.ndarray  # (n, 2) relative, from the detector's covariances; 1 on average
+    noise_px: float  # the detector's standard deviation where that is 1; NaN if it states none
     axes: np.ndarray  # (n, 3, 3) of the tool, 0 where unknown
     frame: np.ndarray  # (n,) counted from 0 in their order
     landmark: np.ndarray
@@ -122,11 +123,12 @@ class Problem:
             shut = np.linalg.norm(opening, axis=1) < _NEARLY_SHUT * np.linalg.norm(length, axis=1)
             noise *= np.where(shut, _OF_SHUT, 1.0)[frame, None]
             noise /= np.median(noise)
+        noise_px = float(np.sqrt(np.nanmedian(variance))) if np.isfinite(variance).any() else np.nan
         centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
         y = np.stack([data.u_left, data.u_right], axis=1)
         x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)
         centre_px = (np.array(size) - 1) / 2 if size else np.nanmedian(y, axis=(0, 1)) if len(data) else np.zeros(2)
-        return cls(x, y, data.seen, noise, axes, frame, data.landmark, data.time_s, centre, centre_px)
+        return cls(x, y, data.seen, noise, noise_px, axes, frame, data.landmark, data.time_s, centre, centre_px)
 
     def __len__(self) -> int:
         return len(self.x)

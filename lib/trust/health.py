@@ -207,6 +207,8 @@ def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
             continue
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a, b, k=2)
         pairs = [best for best, second in pairs if best.distance < _RATIO * second.distance]
+        times = np.bincount([m.trainIdx for m in pairs], minlength=len(b))
+        pairs = [m for m in pairs if times[m.trainIdx] == 1]  # a feature to which many match is none of theirs
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
         y = y[np.abs(y[:, :2] - y[:, 2:]).max(axis=1) > _OVERLAY_PX]
         distance, agree = affine_epipolar(y)

@@ -122,7 +122,7 @@ class Verdict:
 def judge(
     data: Correspondences | None, calibration: Calibration | None, *, diagnosis: Diagnosis | None = None,
     health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float = 0.010,
-    error: Exception | None = None, doubts: Sequence[Doubt] = (),
+    error: Exception | None = None, doubts: Sequence[Doubt] = (), epipolar_at_mm: np.ndarray | None = None,
 ) -> Verdict:  # fmt: skip
     """The verdict on a calibration from its own numbers and from witnesses; what is None is left out.
 
@@ -130,6 +130,7 @@ def judge(
         data: What was calibrated with; only its frames tell whether they are enough.
         calibration: None where it was refused; then `error` is the exception.
         epipolar_px: Median epipolar distance of matches between the two images, which know nothing of the tool.
+        epipolar_at_mm: (k, 3) where these matches are, by the calibration; None takes them for near the tool.
         robot_accuracy_mm: As its maker states it.
         doubts: Of the recording (`lib.recordings.Recording.doubts`).
     """
@@ -152,8 +153,9 @@ def judge(
         for finding in (*_residuals(*what), *_geometry(*what)):
             found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
-            n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
-            sd = np.sqrt(n @ calibration.projection_covariance(middle[None])[0] @ n)
+            n, at_mm = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)[None]
+            at_mm = at_mm if epipolar_at_mm is None else epipolar_at_mm
+            sd = np.sqrt(np.median(n @ calibration.projection_covariance(at_mm) @ n))
             text = f"Features of both images lie {epipolar_px:.1f} px (median) off the epipolar lines; "
             text += f"{LIMITS['epipolar'][0]:g} are allowed."
             cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
@@ -287,15 +289,17 @@ def assess(
         detector = detector or Detector.load()
         data = detect(recording, detector)
     if (last := data.frame.max(initial=0)) >= len(recording):
-        raise ValueError(f"data: frame {last} is none of the {len(recording)} of {recording.folder}; is it of this recording?")
-    calibration, error, epipolar_px = None, None, np.nan
+        raise ValueError(f"data: frame {last} is none of the {len(recording)} of {recording.folder}; give its own.")
+    calibration, error, epipolar_px, at_mm = None, None, np.nan, None
     try:
         fit = calibrate if "model" in options else calibrate_as_shown
         calibration = fit(data, image_size_px=recording.image_size_px, **options)
     except ValueError as refused:
         error = refused
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
-        epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
+        features = calibration.pair.triangulate(y[:, :2], y[:, 2:])
+        known = np.isfinite(features.x_mm).all(axis=1)
+        epipolar_px, at_mm = float(np.median(np.abs(features.epipolar_px))), features.x_mm[known] if known.any() else None
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
     if near:  # a lens that distorts is no fault either, and what the robot parks behind a camera is seen nowhere
@@ -318,7 +322,7 @@ def assess(
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
-        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts,
+        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm,
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import Calibration, calibrate
@@ -335,6 +336,19 @@ def _shuffled(window: int) -> Callable[[Scene], None]:
     return _pixels(edit)
 
 
+def _sorted_as_text(scene: Scene, u: np.ndarray) -> np.ndarray:
+    return u[sorted(range(len(u)), key=str)]
+
+
+def _smoothed(window_s: float) -> Callable[[Scene], None]:
+    """The log holds moving averages of the positions."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return uniform_filter1d(x, max(round(window_s / np.median(np.diff(t))), 1), axis=0, mode="nearest")
+
+    return _report(edit)
+
+
 def _gap(share: float) -> Callable[[Scene], None]:
     """The log lacks a stretch, and whoever wrote it joined the ends by a line."""
 
@@ -519,6 +533,8 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("log of another recording", ""): (("robot_noise",), _report(_of_another)),
     **{("cameras change steadily", f"{100 * zoom:.0f} %, {turn} degrees"): (("drift",), _changing(zoom, turn))
        for zoom, turn in ((0.02, 0.0), (0.0, 2.0), (0.1, -5.0))},
+    ("images sorted as text", ""): (("frame_order",), _pixels(_sorted_as_text)),
+    **{("log smoothed", f"{s} s"): (("smoothed_log", "robot_noise"), _smoothed(s)) for s in (0.4, 0.8)},
     ("one camera repeats frames", "left, 30 %"): (("frozen_video",), _repeats(0, 0.3)),
     ("one camera repeats frames", "right, 10 %"): (("frozen_video",), _repeats(1, 0.1)),
 }  # fmt: skip

@@ -349,3 +349,22 @@ def test_too_little_to_say_anything():
     assert diagnose(usual.data.subset(slice(0, 4))).hypotheses == ()
     nothing = replace(usual.data, confidence=np.zeros_like(usual.data.confidence))
     assert diagnose(nothing).best.name == "detector_unfit"
+
+
+def test_images_that_agree_accuse_no_detector():
+    """Frames stamped up to 60 ms off: a third of the landmarks lie far from the robot's report, in both images alike."""
+    usual = take(frames=60)
+    late_s = np.repeat(np.random.default_rng(0).choice([0.0, 0.0, -0.06, 0.06], 60), 3)
+    x_mm = np.stack([usual.kinematics.at(t + np.zeros((1, 3)))[0, k] for t, k in zip(
+        usual.data.time_s + usual.offset_s + late_s, usual.data.landmark, strict=True)])  # fmt: skip
+    best = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).best
+    assert best.name != "detector_unfit" and "adapt" not in best.cure
+
+
+def test_a_base_that_the_detector_hardly_knows_is_no_bent_tool():
+    bent = take("tool bends", "3 %")
+    names = [h.name for h in found(bent).hypotheses]
+    base = (bent.data.landmark == 0)[:, None, None, None]
+    covariance = bent.data.covariance_px2 * np.where(base, 60.0**2, 1.0)
+    vague = found(replace(bent, data=replace(bent.data, covariance_px2=covariance)))
+    assert "tool_bends" in names and "tool_bends" not in [h.name for h in vague.hypotheses]
