@@ -353,12 +353,20 @@ def test_too_little_to_say_anything():
 
 def test_images_that_agree_accuse_no_detector():
     """Frames stamped up to 60 ms off: a third of the landmarks lie far from the robot's report, in both images alike."""
-    usual = take(frames=60)
-    late_s = np.repeat(np.random.default_rng(0).choice([0.0, 0.0, -0.06, 0.06], 60), 3)
+    usual = take(frames=60, fps=2.0)
+    late_s = np.repeat(np.random.default_rng(0).choice([0.0, 0.0, 0.0, 0.0, -0.06, 0.06], 60), 3)
     x_mm = np.stack([usual.kinematics.at(t + np.zeros((1, 3)))[0, k] for t, k in zip(
         usual.data.time_s + usual.offset_s + late_s, usual.data.landmark, strict=True)])  # fmt: skip
     best = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).best
-    assert best.name != "detector_unfit" and "adapt" not in best.cure
+    assert best.name == "robot_noise" and best.text.startswith("In ") and "adapt" not in best.cure
+
+
+@pytest.mark.parametrize(("way", "strength", "told"), [
+    ("images sorted as text", "", "sorted by their names as text: 0, 1, 10"), ("log smoothed", "0.4 s", "smoothed over about"),
+])  # fmt: skip
+def test_the_habits_of_programs_that_write_files_are_named(way, strength, told):
+    best = found(take(way, strength, frames=100)).best
+    assert best.name in SPOILED[way, strength][0] and told in best.text
 
 
 def test_a_base_that_the_detector_hardly_knows_is_no_bent_tool():
