@@ -25,6 +25,7 @@ from lib.least_squares import inverse
 _OFFSET_ROWS = 12
 #: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.
 _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
+_NARROW = 0.05  # quantile of the jaws' opening, which offsets turn most
 #: Axes turn unless their log likelihood is lower by more than this.
 _AS_LIKELY = 3.0
 #: Standard deviations of 1/distance that show a finite distance: one of 2000 sets of affine cameras does; derivatives' step.
@@ -187,7 +188,9 @@ def _turned(
         own = tool_axes(x_mm, np.vstack([offset, np.zeros((3 - len(offset), 3))]))[row]
         return np.where(np.isfinite(own), own, axes)
 
-    if found.offsets.p_value >= _SURE_OFFSETS and not sure:
+    opening = np.linalg.norm(x_mm[row, 2] - x_mm[row, 1], axis=1)
+    turn_mm = found.offsets.prior_sd**2 / np.quantile(opening, _NARROW)  # of tips as far above each other as offsets may be
+    if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or turn_mm < _LEAST_TURN_MM:
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])

@@ -32,7 +32,9 @@ _MOST_MM, _MOST_ALONE_MM = 0.4, 0.25
 #: So many first steps use every detection; later ones drop those that fit another camera.
 _TAKEN = 4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
-_GRID_MM, _POLISHED, _STARTING_ROWS, _REWEIGHTED = (0.0, 0.2, -0.2), 4, 2000, 3
+_GRID_MM, _STARTING_ROWS = (0.0, 0.2, -0.2), 2000
+#: How many starts take more steps, how often rows are weighed anew for a step, and the gain in cost of the last step.
+_POLISHED, _REWEIGHTED, _SETTLED = 4, 3, 0.1
 
 
 class Unsettled(RuntimeWarning):
@@ -211,19 +213,18 @@ def _steps(
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
     step, share, before_px = np.zeros(offset.size), 1.0, np.inf
 
-    def shift(offset: np.ndarray) -> np.ndarray:
-        return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
-
     for i in range(iterations):
+        own = np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes(offset)
+        shift = np.einsum("nij,nj->ni", own, offset[landmark])
         if i < taken:
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
-        found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
+        found = fit(*((x, y - shift) if axes is None else (x + shift, y)), views=views)
         # Outliers that come and go from step to step would be no end; where other axes of rows were chosen they are new.
         views = found.view_inliers if i >= taken + 2 and found.reprojection_rms_px < 1.2 * before_px else None
         before_px = found.reprojection_rms_px
         rows = found.inliers
         J_x, J_c, weight, r = found.system
-        J = _by_offset(axes, offset, landmark)[rows]
+        J = _by_offset(axes, offset, landmark, own)[rows]
         J = J if axes is None else J_x @ J
         information, gradient = _without_cameras(J, J_c, weight, r)
         if np.isnan(p_value):
@@ -262,50 +263,59 @@ def start_of_turning(
 ) -> np.ndarray:
     """Offsets (k, 3) from which to estimate those that turn the axes; of many starts the one that explains most.
 
-    Offsets turn the axes by three numbers: where the tips' middle lies beside the shaft, in two directions, and their
-    heights.  From each point of a grid of them goes a Gauss-Newton step, and from the best go more.  `found` is the
-    calibration by the reported `axes` (n, 3, 3), `turned` gives the axes of offsets.
+    Offsets turn the axes by three numbers (`_turns`).  At each point of a grid of them the others follow linearly, and
+    Gauss-Newton steps lead on from the best.  `found` is the calibration by the reported `axes` (n, 3, 3), `turned` gives
+    the axes of offsets.
     """
     some = np.random.default_rng(0).permutation(found.inliers.sum())[:_STARTING_ROWS]  # every third would be one landmark
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
-    r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]
+    landmark, (turns, along), p = landmark[rows], _turns(k), J_c.shape[2]
+    r = r + (J_x @ axes[rows] @ offset[landmark][:, :, None])[:, :, 0]
     prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
 
     def of_rows(offset: np.ndarray) -> np.ndarray:
         return turned(offset)[rows]
 
-    def from_here(offset: np.ndarray) -> tuple[float, np.ndarray]:
+    def from_here(offset: np.ndarray, *, held: bool = False) -> tuple[float, np.ndarray]:
         """How badly offsets explain the detections, with the cameras free, and where a Gauss-Newton step leads.
 
-        Rows whose axes stay wrong are far off, and count little: the noise is Student's, of 4 degrees of freedom.
+        The step leaves the turn as it is if that is `held`.  Rows whose axes stay wrong are far off, and count little: the
+        noise is Student's, of 4 degrees of freedom.
         """
-        left = r - (J_x @ of_rows(offset) @ offset[landmark[rows]][:, :, None])[:, :, 0]
-        J, p, w = np.concatenate([J_c, J_x @ _by_offset(of_rows, offset, landmark[rows])], axis=2), J_c.shape[2], weight
+        own = of_rows(offset)
+        left = r - (J_x @ own @ offset[landmark][:, :, None])[:, :, 0]
+        J, w = np.concatenate([J_c, J_x @ _by_offset(of_rows, offset, landmark, own, fixed=held)], axis=2), weight
         for _ in range(_REWEIGHTED):
             weighted = (w @ J).reshape(-1, J.shape[2])
             information, gradient = weighted.T @ J.reshape(weighted.shape), weighted.T @ left.ravel()
             rest = left - J_c @ np.linalg.solve(information[:p, :p], gradient[:p])
             r2 = (rest[:, None] @ weight @ rest[:, :, None])[:, 0, 0]
-            w = weight / (1 + r2 / np.median(r2))[:, None, None]
-        information[p:, p:] += prior
+            median = max(np.median(r2), 1e-12)
+            w = weight / (1 + r2 / median)[:, None, None]
+        information[p:, p:] += prior + held * 1e3 * np.trace(information) * turns.T @ turns
         step = np.linalg.solve(information, gradient - np.append(np.zeros(p), prior @ offset.ravel()))[p:]
-        cost = len(r) * np.log(np.median(r2)) + 2 * np.log1p(r2 / np.median(r2)).sum()
+        cost = len(r) * np.log(median) + 2 * np.log1p(r2 / median).sum()
         return float(cost), offset + step.reshape(offset.shape)
 
     starts = []
     for turn in product(_GRID_MM, repeat=3):
-        offset = from_here(np.tensordot(turn, _turns(k)[1], 1))[1]
-        starts.append((*from_here(offset), offset))
+        offset = from_here(np.tensordot(turn, along, 1), held=True)[1]
+        starts.append((from_here(offset, held=True)[0], offset))
     best = min(starts, key=lambda start: start[0])
-    for start in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
-        share = 1.0
-        for _ in range(6):
-            offset = start[2] + share * (start[1] - start[2])
-            new = (*from_here(offset), offset)
-            start, share = (new, 1.0) if new[0] < start[0] else (start, share / 2)
-        best = min(best, start, key=lambda start: start[0])
-    return best[2]
+    for _, offset in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
+        (cost, to), share = from_here(offset), 1.0
+        for _ in range(10):
+            new = from_here(offset + share * (to - offset))
+            if new[0] > cost:
+                share /= 2
+                continue
+            settled = cost - new[0] < _SETTLED
+            offset, cost, to, share = offset + share * (to - offset), *new, 1.0
+            if settled:
+                break
+        best = min(best, (cost, offset), key=lambda start: start[0])
+    return best[1]
 
 
 def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -318,12 +328,14 @@ def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
     return rows, np.linalg.pinv(rows).T.reshape(3, k, 3)
 
 
-def _by_offset(axes: Callable[[np.ndarray], np.ndarray] | None, offset: np.ndarray, landmark: np.ndarray) -> np.ndarray:
-    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes, too."""
+def _by_offset(
+    axes: Callable[[np.ndarray], np.ndarray] | None, offset: np.ndarray, landmark: np.ndarray, own: np.ndarray, *,
+    fixed: bool = False,
+) -> np.ndarray:  # fmt: skip
+    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes `own`, unless `fixed`."""
     k, m = offset.shape
-    own = np.eye(m)[None].repeat(len(landmark), axis=0) if axes is None else axes(offset)
     J = np.einsum("nij,nk->nikj", own, np.eye(k)[landmark]).reshape(-1, m, k * m)
-    for turn, along in zip(*_turns(k), strict=True) if axes is not None else ():
+    for turn, along in () if axes is None or fixed else zip(*_turns(k), strict=True):
         turning = (axes(offset + _STEP * along) - axes(offset - _STEP * along)) / (2 * _STEP)
         J = J + np.einsum("nij,nj->ni", turning, offset[landmark])[:, :, None] * turn
     return J

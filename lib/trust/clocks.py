@@ -36,7 +36,8 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
             text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {size}."
             cure = f"Add {value:.4f} to offset_s in recording.toml; estimate_time_offset checks it."
         else:
-            text = f"The {SIDES[views[0]]} camera alone shows the tool {size} after the frame's time (negative: before)."
+            size, when = size.lstrip("-"), "before" if value < 0 else "after"
+            text = f"The {SIDES[views[0]]} camera alone shows the tool {when} the frame's time, by {size}."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({size})."
         yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
@@ -129,20 +130,20 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
     """Images in the order of their names as text (0, 1, 10, 11, ..., 2), counted from 0 or from 1."""
     if case.misfit(case.null) < FITS:
         return
-    starts = np.nanmin(case.by_frame(case.problem.time), axis=1)
+    starts, number = np.nanmin(case.by_frame(case.problem.time), axis=1), case.problem.number
     for first, views in product((0, 1), ((0, 1), (0,), (1,))):
-        number = np.array(sorted(range(case.frames), key=lambda i, first=first: str(i + first)))
-        later = (starts[number] - starts)[case.problem.frame]
+        order = np.array(sorted(range(number[-1] + 1), key=lambda i, first=first: str(i + first)))[number]
+        later = (np.interp(order, number, starts) - starts)[case.problem.frame]
         x = case.problem.x.copy()
         x[:, list(views)] = case.moved(later)[:, None]
         moved = replace(case.problem, x=x)
-        if (number == np.arange(case.frames)).all() or moved.used.all(axis=1).sum() < 6:
+        if (order == number).all() or moved.used.all(axis=1).sum() < 6:
             continue
         fit = moved.fit()
         what = "images" if len(views) == 2 else f"{SIDES[views[0]]} images"
-        text = f"The {what} are sorted by their names as text: {first}, {first + 1}, 10, 11, ... before {first + 2}."
+        text = f"The {what} are sorted by their names as text: {'1' if first else '0, 1'}, 10, 11, ... before 2."
         cure = "Sort them by number, or give the names leading zeros: 000, 001, 002, ..."
-        share = 100.0 * float((number != np.arange(case.frames)).mean())
+        share = 100.0 * float((order != number).mean())
         yield case.found("frame_order", fit, 1, (share, 0.0, "%"), text, cure, on=moved, images=views)
 
 
@@ -153,7 +154,7 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
     value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
     if value > 3 * sd:
-        text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: that cuts corners, shrinks all motion."
+        text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
         cure = "Log the positions as they are measured, without a filter."
         size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
         yield case.found("smoothed_log", fit, 1, size, text, cure, on=known)

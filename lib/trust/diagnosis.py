@@ -81,7 +81,7 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
         x = case.problem.x * tips[:, None, None]
         fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
-        if size < _BENDS * case.problem.noise_px * np.median(case.problem.noise[~tips]):
+        if size < _BENDS * np.nanmedian(np.append(case.problem.stated_px[~tips], 0.0)):
             return  # the detector knows the base no better
         text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
@@ -284,7 +284,8 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
     both, half = problem.used.all(axis=1), problem.used.sum() / 2.0
     distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # NaN of few, which is no witness
-    epipolar = float(np.sqrt(2.0) * np.quantile(distances[off[both].any(axis=1)], 0.75 if off is far else 0.5))
+    witness = distances[off[both].any(axis=1)]
+    epipolar = float(np.sqrt(2.0) * np.quantile(witness, 0.75 if off is far else 0.5)) if witness.size else np.nan
     gain = half * (share * np.log(max(share, 1e-9) / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"

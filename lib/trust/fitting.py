@@ -94,9 +94,10 @@ class Problem:
     y: np.ndarray  # (n, 2, 2) px
     seen: np.ndarray  # (n, 2) bool
     noise: np.ndarray  # (n, 2) relative, from the detector's covariances; 1 on average
-    noise_px: float  # the detector's standard deviation where that is 1; NaN if it states none
+    stated_px: np.ndarray  # (n, 2) RMS distance by which the detector says that it errs; 0 where it says nothing
     axes: np.ndarray  # (n, 3, 3) of the tool, 0 where unknown
     frame: np.ndarray  # (n,) counted from 0 in their order
+    number: np.ndarray  # (frames,) of these in the recording
     landmark: np.ndarray
     time: np.ndarray
     centre: np.ndarray
@@ -116,19 +117,19 @@ class Problem:
         with np.errstate(all="ignore"):
             noise = np.sqrt(variance / np.nanmedian(variance)) if np.isfinite(variance).any() else variance
         noise = np.clip(np.where(np.isfinite(noise), noise, 1.0), 0.5, 4.0)
-        frame = np.unique(data.frame, return_inverse=True)[1]
+        number, frame = np.unique(data.frame, return_inverse=True)
         if axes.any():  # offsets turn those of jaws that are nearly shut
             tool = data.grid("x_mm")
             opening, length = tool[:, 2] - tool[:, 1], (tool[:, 1] + tool[:, 2]) / 2 - tool[:, 0]
             shut = np.linalg.norm(opening, axis=1) < _NEARLY_SHUT * np.linalg.norm(length, axis=1)
             noise *= np.where(shut, _OF_SHUT, 1.0)[frame, None]
             noise /= np.median(noise)
-        noise_px = float(np.sqrt(np.nanmedian(variance))) if np.isfinite(variance).any() else np.nan
         centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
         y = np.stack([data.u_left, data.u_right], axis=1)
         x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)
         centre_px = (np.array(size) - 1) / 2 if size else np.nanmedian(y, axis=(0, 1)) if len(data) else np.zeros(2)
-        return cls(x, y, data.seen, noise, noise_px, axes, frame, data.landmark, data.time_s, centre, centre_px)
+        of_rows = (axes, frame, number, data.landmark, data.time_s)
+        return cls(x, y, data.seen, noise, np.sqrt(np.nan_to_num(variance)), *of_rows, centre, centre_px)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -373,9 +374,9 @@ class Case:
 
 
 def compared(found: list[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses whose gains can be compared: rows count by one design for all, the least of those that are named.
+    """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs.
 
-    A cause of one or two numbers that leaves little may leave it in stretches, by which its own rows would hardly count.
+    So they do for causes of one or two numbers: what is left may be in stretches, by which its own rows hardly count.
     """
     least, gains = min((h.evidence[3] for h in found if h.is_named), default=np.inf), []
     for h in found:

@@ -138,7 +138,7 @@ def judge(
     best = None if diagnosis is None else diagnosis.best
     if best is not None:
         text = best.text
-        if best.name not in (*BY_GEOMETRY, "detector_unfit"):
+        if best.name not in (*BY_GEOMETRY, "detector_unfit", "robot_noise"):
             text += f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
@@ -190,7 +190,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
     text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
-    more = " From four frames of open jaws on, constant offsets of the landmarks are estimated, too." * (c.offsets is None)
+    more = " Constant offsets of the landmarks need four frames and more, half of all, with open jaws." * (c.offsets is None)
     yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector.{more}"
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
