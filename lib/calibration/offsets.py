@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
-from lib.calibration.robust import NoConsensusError
+from lib.calibration.robust import CompetingCamerasError, LooseCameraError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import cross
@@ -170,8 +170,8 @@ def estimate_offsets(
     pixels (n, m) with the `views` to use, and one Schur complement; an `Unsettled` warning where `iterations` are too few.
     `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
     prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
-    Where no cameras agree or two compete, or one landmark hardly agrees with the others' cameras, small offsets may explain
-    it; else the `NoConsensusError`, or the calibration without that landmark, stays.
+    Where rows agree loosely or two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may
+    explain it; else the `NoConsensusError`, or the calibration without that landmark, stays.
     """
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
@@ -179,7 +179,7 @@ def estimate_offsets(
     found, competing = None, None
     try:
         found = steps()
-    except NoConsensusError as error:
+    except (CompetingCamerasError, LooseCameraError) as error:
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found

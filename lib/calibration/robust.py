@@ -26,11 +26,16 @@ _CONTRAST = 8.0
 #: Largest noise, as a share of the pixels' extent, where there are outliers that do not stand clearly apart; and without any.
 _LARGEST_NOISE = (0.01, 0.25)
 _TAILS = 0.1  # share of outliers up to which they may be the tails of the noise; more must stand apart
+_LOOSE = 3.0  # times the largest noise, up to which offsets of the landmarks may be the reason
 _NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
 
 
 class NoConsensusError(DataError):
     """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
+
+
+class LooseCameraError(NoConsensusError):
+    """Most rows agree on one camera, but loosely: landmarks that are constantly off leave as much."""
 
 
 class CompetingCamerasError(NoConsensusError):
@@ -91,7 +96,9 @@ def _one_camera(
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
         what = f"all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in {count} of {n} rows"
-        raise NoConsensusError(f"{name}: no consensus, {what}, and the others do not stand apart; {cure}.")
+        loose = 2 * count > n and found.sigma_px < _LOOSE * _LARGEST_NOISE[0] * extent
+        kind = LooseCameraError if loose else NoConsensusError
+        raise kind(f"{name}: no consensus, {what}, and the others do not stand apart; {cure}.")
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
     if threshold_px is not None or len(rest) < least:
         return found

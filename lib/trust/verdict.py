@@ -10,7 +10,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import paths
-from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
+from lib.calibration import Calibration, CompetingCamerasError, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.calibration.checks import extents
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
@@ -142,7 +142,8 @@ def judge(
             text += f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
-        name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
+        kinds = {NoDetectionError: "no_detection", CompetingCamerasError: "refused", NoConsensusError: "no_consensus"}
+        name = next((name for kind, name in kinds.items() if isinstance(error, kind)), "refused")
         cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         if name == "refused":  # the error names its cure
             few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
