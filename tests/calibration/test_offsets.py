@@ -133,7 +133,7 @@ def test_offsets_of_few_frames_are_estimated_and_none_are_invented(frames):
     assert error_px(0.0, {}) < 1.1 * error_px(0.0, {"offsets": False})
 
 
-@pytest.mark.parametrize("seed", [4, 7, 12])
+@pytest.mark.parametrize("seed", [4, 7, 12, 29, 39])
 def test_landmarks_that_are_off_are_no_reason_to_refuse_a_small_workspace(seed):
     rng, (data, rig, _) = np.random.default_rng(seed), tool_sweep(seed, frames=36, turn_rad=0.3)
     x = data.grid("x_mm")
@@ -144,7 +144,7 @@ def test_landmarks_that_are_off_are_no_reason_to_refuse_a_small_workspace(seed):
     reported = x - np.einsum("nij,kj->nki", tool_axes(x), offset) + rng.normal(0, 0.004, x.shape)
     u = [p + rng.normal(0, 0.4, p.shape) for p in rig.project(x.reshape(-1, 3))]
     found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
-    assert found.view_inliers.mean() > 0.95 and found.reprojection_rms_px < 1.2
+    assert found.view_inliers.mean() > 0.95 and found.reprojection_rms_px < 1.5
 
 
 def test_some_rows_of_all_landmarks_tell_where_turning_offsets_start(monkeypatch):
