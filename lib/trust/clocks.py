@@ -12,6 +12,7 @@ from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
 _ROWS = 400  # of the coarse search
+_WORTH = 20.0  # log likelihood that some other clock or order gains, before another one is tried
 _FAR_OFF = 0.01  # a rate that differs by more must make most of the frames fit
 
 
@@ -128,7 +129,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
 
 def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
     """Images in the order of their names as text (0, 1, 10, 11, ..., 2), counted from 0 or from 1."""
-    if case.misfit(case.null) < FITS:
+    if all(fit.total < case.null.total + _WORTH for fit in case.fits.values()):  # other instants explain nothing
         return
     starts, number = np.nanmin(case.by_frame(case.problem.time), axis=1), case.problem.number
     for first, views in product((0, 1), ((0, 1), (0,), (1,))):
