@@ -96,7 +96,7 @@ def _pytest(argv: list[str]) -> int:
     keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays take memory that is at hand
     keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # every package's plugin takes time to load
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
-    return subprocess.call(command, env=keep | os.environ | {"PYTHONDONTWRITEBYTECODE": ""})  # else each compiles anew
+    return subprocess.call(command, env=keep | os.environ)
 
 
 def _call(name: str, argv: list[str]) -> int:

@@ -245,7 +245,7 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
 
 
 def _own_bias(seen: Seen) -> np.ndarray:
-    """`_OWN_BIAS` (3, 3) of a detector that is as sure of the base as it says."""
+    """Standard deviations (3, 3) of a detector's own constant errors, as `_OWN_BIAS`, from how sure it is of the base."""
     along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
     stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
     own = _OWN_BIAS.copy()

@@ -189,8 +189,8 @@ def _turned(
         return np.where(np.isfinite(own), own, axes)
 
     opening = np.linalg.norm(x_mm[row, 2] - x_mm[row, 1], axis=1)
-    turn_mm = found.offsets.prior_sd**2 / np.quantile(opening, _NARROW)  # of tips as far above each other as offsets may be
-    if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or turn_mm < _LEAST_TURN_MM:
+    usual_mm = found.offsets.prior_sd**2 / np.quantile(opening, _NARROW)  # an offset, times the angle by which another turns
+    if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or usual_mm < _LEAST_TURN_MM:
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])

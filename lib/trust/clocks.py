@@ -149,7 +149,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 
 
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
-    """A log that is a moving average: it cuts corners, by the acceleration times the square of its window over 24."""
+    """A log of moving averages: each is off by the acceleration, times the square of the window, over 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
     known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
