@@ -32,7 +32,8 @@ LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.
 FAULTS = {
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
-    "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log",
+    "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
+    "zoom_varies",
 }  # fmt: skip
 _EXPLAINED = 0.15
 #: Residuals below this share of the tool's length hold no fault that matters, however well one explains them.
@@ -411,7 +412,8 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    how = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    names = "kinematics offset_s readout_s image_size_px robot_accuracy_mm".split()
+    how = {name: getattr(recording, name) for name in names}
     best = diagnose(rows, near=True, offsets=calibration.offsets, **how).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 

@@ -1,7 +1,7 @@
 """What is wrong with a recording: hypotheses fitted to its correspondences, and compared with "nothing is wrong".
 
-Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`.  Each is fitted under
-heavy-tailed noise (`lib.trust.fitting`).  Its gain in log likelihood, less a penalty for its parameters (BIC), is its
+Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`, those of what changes
+from frame to frame in `lib.trust.unsteady`.  Each is fitted under heavy-tailed noise (`lib.trust.fitting`).  Its gain in log likelihood, less a penalty for its parameters (BIC), is its
 evidence.
 """
 
@@ -17,13 +17,13 @@ from lib.calibration import LandmarkOffsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust, compared
+from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens
+from lib.trust.unsteady import FRAME_TESTS, is_constant
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
-_ROBOT_MM = 0.04  # a robot for eye surgery is better
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
@@ -31,7 +31,9 @@ _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, 
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _BENDS = 1.5  # standard deviations that the detector states of the base, below which it moves as tips of a bent tool do
 _UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
-_STILL_PX = 0.3  # detections of one picture differ by less
+_MOSTLY = 0.5  # of the residuals, which a named cause explains
+_OUTSIDE = 0.25  # of the frames; a log that begins late has fewer, and cameras fit
+_STILL_PX, _STILL_MM = 0.3, 0.04  # detections of one picture, and a robot that rests, differ by less
 
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
@@ -81,7 +83,7 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
         x = case.problem.x * tips[:, None, None]
         fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
-        if size < _BENDS * np.nanmedian(np.append(case.problem.stated_px[~tips], 0.0)):
+        if size < _BENDS * case.problem.claimed_px(~tips):
             return  # the detector knows the base no better
         text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
@@ -93,7 +95,7 @@ def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
     tips = case.by_frame(case.problem.x[:, 0])[:, 1:]
     width = np.linalg.norm(tips[:, 1] - tips[:, 0], axis=1)
     width = width[np.isfinite(width)]
-    if case.problem.landmark.max() != 2 or not len(width) or _is_constant(width):
+    if case.problem.landmark.max() != 2 or not len(width) or is_constant(width):
         return
     share = np.array([0.0, -0.5, 0.5])[case.problem.landmark]
     half = (tips[:, 1] - tips[:, 0])[case.problem.frame] * share[:, None]
@@ -103,11 +105,6 @@ def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
         text = f"In the images the tips are {factor:.2f} +- {sd:.2f} times as far apart as in the robot's report."
         cure = "Does the robot's log state the opening of one jaw or of both? Check that, and the length of the jaws."
         yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
-
-
-def _is_constant(width_mm: np.ndarray) -> bool:
-    """Whether the robot reports one opening of the jaws, but for its noise."""
-    return bool(width_mm.std() <= max(0.02 * width_mm.mean(), 0.03))
 
 
 def _log_spikes(case: Case) -> Iterator[Hypothesis]:
@@ -179,7 +176,14 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     if case.frames < 8:
         return
     frame, both = problem.other_cameras(case.null)
-    slipped = problem.axes * (problem.frame >= frame)[:, None, None]
+    late = (problem.frame >= frame)[:, None]
+    y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
+    exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
+    text = f"From about frame {frame} of those seen on, the left image is the right one."
+    cure = "Exchange the images of these frames between left/ and right/."
+    fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
+    yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
+    slipped = problem.axes * late[..., None]
     fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
     if fit.total > both.total - _AS_GOOD:
         size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
@@ -189,8 +193,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     for views in ((0, 1), (0,), (1,)):
         fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
-        late = problem.used[:, views] & (problem.frame >= frame)[:, None]
-        size = float(np.sqrt((fit.moved_px[:, views][late] ** 2).sum() / max(late.sum(), 1)))
+        rows = problem.used[:, views] & late
+        size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."
@@ -243,31 +247,6 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         yield replace(certain("frozen_video", fit, twice, text, cure), images=tuple(views))
 
 
-def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
-    """The robot reports tips at a fixed distance while the jaws open: one opening a frame, with a prior."""
-    problem, tips = case.problem, case.by_frame(case.problem.x[:, 0])
-    width = np.linalg.norm(tips[:, 2] - tips[:, 1], axis=1)
-    width = width[np.isfinite(width)]
-    if len(width) < 6 or not _is_constant(width):
-        return
-    side = np.select([problem.landmark == 1, problem.landmark == 2], [-1.0, 1.0], 0.0)
-    fit, sd = case.null, 0.2
-    for _ in range(8):
-        d = np.einsum("cij,nj->nci", fit.M[:, :, :3], problem.axes[:, :, 1]) * side[:, None, None]
-        weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)[:, :, None]
-        seen = problem.missed(fit, problem.x)
-        information = np.bincount(problem.frame, (weight * d * d).sum(axis=(1, 2)), case.frames)
-        opening = np.bincount(problem.frame, np.nansum(weight * d * seen, axis=(1, 2)), case.frames) / (information + sd**-2)
-        sd = max(float(np.sqrt((opening**2 + 1.0 / (information + sd**-2)).mean())), 1e-3)
-        x = problem.x + (side * opening[problem.frame])[:, None, None] * problem.axes[:, None, :, 1]
-        fit = replace(problem, x=x).fit(start=fit.start, rounds=10)
-    size = 2.0 * float(opening.std())
-    text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
-    cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
-    chosen = 0.5 * float((np.log1p(sd**2 * information) + (opening / sd) ** 2).sum())  # the openings integrated out
-    yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=fit.total - case.null.total - chosen)
-
-
 def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     """Residuals that the best cause leaves: the two images disagree with each other (the detector) or with the robot."""
     problem = replace(case.problem, seen=case.problem.seen & ~fit.apart[:, None])
@@ -287,7 +266,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     witness = distances[off[both].any(axis=1)]
     epipolar = float(np.sqrt(2.0) * np.quantile(witness, 0.75 if off is far else 0.5)) if witness.size else np.nan
     gain = half * (share * np.log(max(share, 1e-9) / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
-    if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
+    if epipolar < 0.25 * missed and missed > case.robot_mm * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
         text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px."
         cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
@@ -298,6 +277,21 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         return []
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
+
+
+def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s: float) -> list[Hypothesis]:
+    """A clock so far off that the robot's log is of another time than many frames."""
+    time = np.unique(data.time_s[data.seen.any(axis=1)]) + offset_s
+    if kinematics is None or not len(time) or not np.isfinite(time).all():
+        return []
+    first, last = kinematics.time_s[[0, -1]]
+    outside = float(((time < first) | (time > last)).mean())
+    if outside < _OUTSIDE:
+        return []
+    text = f"{100 * outside:.0f} % of the frames, which are of {time[0]:.1f} to {time[-1]:.1f} s of the robot's clock, lie "
+    text += f"outside its log, {first:.1f} to {last:.1f} s."
+    cure = "Check offset_s in recording.toml, and the times in frames.csv and kinematics.csv."
+    return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
 
 
 @dataclass(frozen=True)
@@ -315,6 +309,7 @@ class Diagnosis:
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
     image_size_px: tuple[int, int] | None = None, near: bool = False, offsets: LandmarkOffsets | None = None,
+    robot_accuracy_mm: float = 0.010,
 ) -> Diagnosis:  # fmt: skip
     """Fit every hypothesis about what could be wrong, and rank them.
 
@@ -322,7 +317,8 @@ def diagnose(
         data: The rows that were, or could not be, calibrated with.
         kinematics: The robot's log, which tells where the tool was a little earlier or later.  Without it the rows' own
             positions do, where the frames follow each other within 0.25 s.
-        offset_s, readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
+        offset_s, readout_s, image_size_px, robot_accuracy_mm: As the recording states them; without a size nothing is said of
+            the read-out time.
         near: The cameras that were calibrated have a finite distance, so that it is no fault.
         offsets: Of the landmarks, as they were calibrated.  They turn the axes of jaws that are nearly shut.
 
@@ -340,15 +336,17 @@ def diagnose(
     few = problem.used.all(axis=1).sum() < 6
     if len(frames) < _FEWEST_FRAMES or (few and len(data) < 12):
         return Diagnosis()
+    apart = _log_elsewhere(data, kinematics, offset_s)
     if few:
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
-        return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
+        unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
+        return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
-    if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
+    if moved_px < _STILL_PX and moved_mm > _STILL_MM:
         text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    stated = kinematics, offset_s, readout_s, image_size_px
+    stated = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
     whole = case = Case(problem, *stated)
     # Where a tool rests its detections repeat one error, which is no fault that begins or ends there.
     x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)
@@ -357,8 +355,10 @@ def diagnose(
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
-    tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, _rigid_tips]
+    tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, *FRAME_TESTS]
     found = compared([h for test in tests for h in test(whole if test is _frozen else case)])
+    if case.misfit(case.null, case.fits.get("clock", case.null)) >= FITS:
+        found += apart
     best = Diagnosis(found := [h for h in found if np.isfinite(h.gain)]).best
     if best is None:  # other faults look like offsets, too
         found += _landmark_offset(case)
@@ -366,7 +366,10 @@ def diagnose(
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
     more = [] if near else list(finite_distance(case, fit))
-    found += [h for h in (*more, *axes_and_eyes(case, fit, -1.0 if turned else 1.0)) if np.isfinite(h.gain)]
+    more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
+    if best is not None and best.explained > _MOSTLY:  # a fault of this size may skew the pixels; the next check tells
+        more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name == "scaled_axis" else h for h in more]
+    found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

@@ -27,6 +27,7 @@ SIDES = ("left", "right")
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
 _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
+_LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a robot for eye surgery errs by less, and by less than so often what is stated
 _NEARLY_SHUT, _OF_SHUT = 0.15, 3.0  # jaws that open less, of the tool's length, and by how much more noise these have
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _TRIED = 6  # rounds of a fit that tells which frame is better
@@ -138,6 +139,10 @@ class Problem:
     def used(self) -> np.ndarray:
         """(n, 2) bool: the image shows the landmark and the robot reports it."""
         return self.seen & np.isfinite(self.x).all(axis=2)
+
+    def claimed_px(self, rows: np.ndarray | slice = slice(None)) -> float:
+        """The distance by which the detector says that it errs, the median of rows; 0 where it says nothing."""
+        return float(np.nanmedian(np.append(self.stated_px[rows], 0.0)))
 
     def fit(
         self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
@@ -296,12 +301,15 @@ class Case:
 
     `paths` are the landmarks' in time: of the robot's log, else of the rows where the frames follow each other closely, else
     None.  `log` (m, k, 3) has the robot's positions, else the rows'.  `size` is (width, height) or None; `frames` a number.
+    A robot that errs by more than `robot_mm` is no good one.
     """
 
     def __init__(
-        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
-    ) -> None:
+        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None,
+        robot_accuracy_mm: float,
+    ) -> None:  # fmt: skip
         self.problem, self.kinematics, self.readout_s, self.size = problem, kinematics, readout_s, size
+        self.robot_mm = max(_LEAST_ROBOT_MM, _TIMES * robot_accuracy_mm)
         self.null, self.fits = problem.fit(), {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s, self.at_s = None, offset_s, problem.time + offset_s

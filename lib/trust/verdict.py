@@ -301,7 +301,8 @@ def assess(
         features = calibration.pair.triangulate(y[:, :2], y[:, 2:])
         known = np.isfinite(features.x_mm).all(axis=1)
         epipolar_px, at_mm = float(np.median(np.abs(features.epipolar_px))), features.x_mm[known] if known.any() else None
-    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    names = "kinematics offset_s readout_s image_size_px robot_accuracy_mm".split()
+    stated = {name: getattr(recording, name) for name in names}
     straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
     if near:  # a lens that distorts is no fault either, and what the robot parks behind a camera is seen nowhere
         left, right = calibration.cameras

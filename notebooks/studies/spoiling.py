@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import Calibration, calibrate
@@ -61,6 +61,7 @@ class Scene:
     noise_px: float = 1.2
     tail: float = np.inf  # degrees of freedom of the detections' errors
     memory: float = 0.0  # their correlation from frame to frame
+    shared: float = 0.0  # and between the landmarks of an image
     anisotropy: float = 1.0  # by how much larger they are along the rows of the image, with the same RMS
     bias_mm: float = 0.0  # constant offsets of the detected landmarks
     missing: float = 0.0
@@ -75,7 +76,7 @@ class Scene:
     edit_report: list[Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]] = field(default_factory=list)
     stated_readout_s: float | None = None
     offset_s: float = 0.0  # by which the stated clock is wrong
-    camera_late_s: tuple[float, float] = (0.0, 0.0)
+    camera_late_s: tuple[float | np.ndarray, float | np.ndarray] = (0.0, 0.0)  # of each frame, if not of all
     rate: float = 1.0
     move: tuple[float, RigidTransform] | None = None  # share of the frames before it, and the motion of the rig
     drift_px: float = 0.0
@@ -138,6 +139,9 @@ class Scene:
         noise = rng.normal(size=exact.shape)
         for i in range(1, self.frames):
             noise[i] = self.memory * noise[i - 1] + np.sqrt(1 - self.memory**2) * noise[i]
+        if self.shared:
+            common = rng.normal(size=(self.frames, 1, *noise.shape[2:]))
+            noise = np.sqrt(1 - self.shared) * noise + np.sqrt(self.shared) * common
         noise *= np.sqrt(2.0 / (1.0 + self.anisotropy**2)) * np.array([self.anisotropy, 1.0])
         if np.isfinite(self.tail):
             noise /= np.sqrt(rng.chisquare(self.tail, (*exact.shape[:3], 1)) / self.tail)
@@ -212,6 +216,7 @@ def examine(take: Take, fit: Callable[..., Calibration] = calibrate) -> Result:
     diagnosis = diagnose(
         take.data, kinematics=take.kinematics, offset_s=take.offset_s, readout_s=take.readout_s,
         image_size_px=take.image_size_px, near=calibration is not None and calibration.inverse_distance_per_mm[1] > 0,
+        robot_accuracy_mm=take.robot_accuracy_mm,
     )  # fmt: skip
     verdict = judge(
         take.data, calibration, diagnosis=diagnosis, robot_accuracy_mm=take.robot_accuracy_mm, error=error
@@ -347,6 +352,52 @@ def _smoothed(window_s: float) -> Callable[[Scene], None]:
         return uniform_filter1d(x, max(round(window_s / np.median(np.diff(t))), 1), axis=0, mode="nearest")
 
     return _report(edit)
+
+
+def _swaying(size_px: float, views: tuple[int, ...], frames: float = 0.1) -> Callable[[Scene], None]:
+    """Images shift about a point, by so much (RMS), at the pace of some frames; those of two views alike."""
+
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        shift = gaussian_filter1d(scene.rng.normal(size=(len(u), 1, 2)), frames, axis=0)
+        u = u.copy()
+        u[:, :, list(views)] += (size_px * shift / shift.std())[:, :, None]
+        return u
+
+    return _pixels(edit)
+
+
+def _breathing(share: float, period_s: float, views: tuple[int, ...]) -> Callable[[Scene], None]:
+    """Images grow and shrink about their centre, as those of a lens that hunts for its focus."""
+
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        centre, phase = (np.array(_SIZE) - 1) / 2, 2 * np.pi * (np.arange(len(u)) / scene.fps / period_s + scene.rng.random())
+        u, grown = u.copy(), (1 + share * np.sin(phase))[:, None, None, None]
+        u[:, :, list(views)] = centre + grown * (u[:, :, list(views)] - centre)
+        return u
+
+    return _pixels(edit)
+
+
+def _jittering(seconds: float) -> Callable[[Scene], None]:
+    """Each pair of images is stamped early or late by some time of its own."""
+
+    def apply(scene: Scene) -> None:
+        late_s = scene.rng.normal(0, seconds, scene.frames)
+        scene.camera_late_s = (late_s, late_s)
+
+    return apply
+
+
+def _backlash(size_mm: float) -> Callable[[Scene], None]:
+    """Along each axis the robot is elsewhere by so much where it moves the other way."""
+    return _report(lambda scene, t, x: x + 0.5 * size_mm * np.sign(np.gradient(gaussian_filter1d(x, 4, axis=0), axis=0)))
+
+
+def _exchanged_later(scene: Scene, u: np.ndarray) -> np.ndarray:
+    """From the middle on left is right."""
+    u, first = u.copy(), round(scene.rng.uniform(0.3, 0.7) * len(u))
+    u[first:] = u[first:, :, ::-1].copy()
+    return u
 
 
 def _gap(share: float) -> Callable[[Scene], None]:
@@ -537,6 +588,16 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     **{("log smoothed", f"{s} s"): (("smoothed_log", "robot_noise"), _smoothed(s)) for s in (0.4, 0.8)},
     ("one camera repeats frames", "left, 30 %"): (("frozen_video",), _repeats(0, 0.3)),
     ("one camera repeats frames", "right, 10 %"): (("frozen_video",), _repeats(1, 0.1)),
+    ("left image sways", "4 px, each frame"): (("image_sways",), _swaying(4.0, (0,))),
+    ("right image sways", "8 px, slowly"): (("image_sways",), _swaying(8.0, (1,), 4.0)),
+    ("microscope sways", "6 px, each frame"): (("robot_noise",), _swaying(6.0, (0, 1))),
+    ("microscope sways", "12 px, slowly"): (("robot_noise",), _swaying(12.0, (0, 1), 4.0)),
+    ("lenses breathe", "1 %"): (("zoom_varies",), _breathing(0.01, 1.7, (0, 1))),
+    ("left lens breathes", "2 %"): (("zoom_varies",), _breathing(0.02, 0.9, (0,))),
+    **{("frames stamped apart", f"{1e3 * s:.0f} ms"): (("time_stamps",), _jittering(s)) for s in (0.02, 0.06)},
+    ("robot has backlash", "0.1 mm"): (("backlash",), _backlash(0.1)),
+    ("eyes exchanged later", ""): (("exchanged_eyes",), _pixels(_exchanged_later)),
+    ("clock", "3 s"): (("clock",), _set(offset_s=3.0)),
 }  # fmt: skip
 
 #: Good recordings: sizes, rigs, noise levels, detectors.
@@ -565,6 +626,7 @@ GOOD: dict[str, dict[str, object]] = {
     "a spike in the log": {"edit_report": [_spike]},
     "images squeezed by 3 %": {"edit_rig": _of_cameras(_squeezed(0.97))},
     "left image squeezed by 7 %": {"edit_rig": _of_cameras(_squeezed(0.93), (0,))},
+    "errors shared by a frame's landmarks": {"shared": 0.5},
 }
 
 

@@ -64,6 +64,9 @@ def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
         ("tips too near or far apart", "0.5", 2.0), ("lens distorts", "10 %", 10.0), ("spikes in the log", "10 %", None),
         ("one camera repeats frames", "left, 30 %", None), ("tool slips", "0.5 mm", 500.0),
         ("cameras change steadily", "10 %, -5.0 degrees", None), ("log of another recording", "", None),
+        ("left image sways", "4 px, each frame", 4.0 * np.sqrt(2)), ("microscope sways", "6 px, each frame", None),
+        ("left lens breathes", "2 %", 1.4), ("robot has backlash", "0.1 mm", None),
+        ("frames stamped apart", "20 ms", None), ("eyes exchanged later", "", None),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
@@ -338,10 +341,15 @@ def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
     assert best.name == "clock" and best.value == pytest.approx(20, abs=5)
 
 
-def test_the_edge_of_the_search_is_stated():
-    late = take(offset_s=1.1, frames=14)
-    clock = next(h for h in found(late).hypotheses if h.name == "clock")
-    assert "edge of the search" in clock.text
+@pytest.mark.parametrize("offset_s", [-2.1, 3.0])
+def test_a_clock_that_is_off_by_seconds_is_found_where_log_and_video_still_overlap(offset_s):
+    clock = found(take(offset_s=offset_s, frames=60)).best
+    assert clock.name == "clock" and clock.value == pytest.approx(-1e3 * offset_s, abs=max(4 * clock.sd, 5))
+
+
+def test_a_log_of_another_time_accuses_the_clock_and_no_detector():
+    best = found(take(offset_s=100.0)).best
+    assert best.name == "clock" and "100 % of the frames, which are of 100.0 to 102.6 s" in best.text
 
 
 def test_too_little_to_say_anything():

@@ -1,0 +1,127 @@
+"""Hypotheses of numbers that each frame has for itself: jaws, clocks, images, zooms and robots that do not keep still.
+
+The numbers of the frames are normal, of one standard deviation, which is estimated; the evidence integrates over them.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
+
+_FEWEST_FRAMES = 8
+_ROUNDS, _STEPS = 8, 10  # of cameras beside the numbers, and of the numbers' deviation beside given cameras
+_MOST = 0.5  # by so much of its RMS a number must differ from 0 in most frames: gross errors are in a part of them
+
+
+def rigid_tips(case: Case) -> Iterator[Hypothesis]:
+    """The robot reports tips at a fixed distance while the jaws open."""
+    problem, tips = case.problem, case.by_frame(case.problem.x[:, 0])
+    width = np.linalg.norm(tips[:, 2] - tips[:, 1], axis=1)
+    width = width[np.isfinite(width)]
+    if len(width) < 6 or not is_constant(width):
+        return
+    half = problem.axes[:, :, 1] * np.array([0.0, -1.0, 1.0])[np.minimum(problem.landmark, 2), None]
+    found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None], 0.2)
+    size = 2.0 * float(found.theta.std())
+    text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
+    cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
+    yield case.found("rigid_tips", found.fit, 1, (size, 0.0, "mm"), text, cure, raw=found.raw)
+
+
+def is_constant(width_mm: np.ndarray) -> bool:
+    """Whether the robot reports one opening of the jaws, but for its noise."""
+    return bool(width_mm.std() <= max(0.02 * width_mm.mean(), 0.03))
+
+
+def unsteady_robot(case: Case) -> Iterator[Hypothesis]:
+    """The robot's report and the images part from frame to frame, all landmarks alike: along its path, or anyhow."""
+    problem = case.problem
+    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0 or _still(case):
+        return
+    found = _by_frame(case, lambda M: np.broadcast_to(M[:, :, :3], (len(problem), 2, 2, 3)), 0.05)
+    size = np.sqrt(3.0) * found.sd
+    if found.in_most and found.moved_px > problem.claimed_px() and size > case.robot_mm:
+        text = f"From frame to frame images and robot part by {size:.2g} mm (RMS), all landmarks alike."
+        cure = "Fix the microscope and the robot's base; check times, units and columns of kinematics.csv."
+        yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
+    if case.paths:
+        velocity = np.nan_to_num(case.velocity())
+        found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
+        if found.in_most and found.moved_px > problem.claimed_px():
+            text = f"The times of the frames err by {1e3 * found.sd:.2g} ms (RMS), each by itself, or those of the log do."
+            cure = "Write down when the camera exposed each frame, and the robot measured each position; do not round."
+            yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
+
+
+def _still(case: Case) -> bool:
+    """Whether the robot's positions of each landmark are one."""
+    each = [case.problem.x[case.problem.landmark == k, 0] for k in np.unique(case.problem.landmark)]
+    return max(np.ptp(x, axis=0).max() for x in each) < case.robot_mm
+
+
+def unsteady_images(case: Case) -> Iterator[Hypothesis]:
+    """An image that sways, or one or two that zoom."""
+    problem = case.problem
+    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0:
+        return
+    shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
+    zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
+    sways = shift, 3.0, "px", "image_sways", "sways", "Fix that camera, and turn off stabilisation of the image."
+    zooms = zoom, 1.0, "%", "zoom_varies", "zooms in and out", "Record without autofocus, at one zoom."
+    for views, (columns, sd, unit, name, does, cure) in (
+        ((0,), sways), ((1,), sways), ((0, 1), zooms), ((0,), zooms), ((1,), zooms)
+    ):  # fmt: skip
+        moved = np.concatenate([columns * (np.arange(2) == view)[:, None, None] for view in views], axis=3)
+        found = _by_frame(case, lambda M, moved=moved: moved, sd)
+        if found.in_most and (unit == "%" or found.moved_px > problem.claimed_px()):
+            who = "Each image" if len(views) == 2 else f"The {SIDES[views[0]]} image alone"
+            size = found.sd * np.sqrt(columns.shape[3])
+            text = f"{who} {does} from frame to frame, by {size:.2g} {unit} (RMS)."
+            yield case.found(name, found.fit, 1, (size, 0.0, unit), text, cure, raw=found.raw, images=views)
+
+
+class _Numbers(NamedTuple):
+    """Of the frames, N(0, sd^2): the fit beside them, theta (frames, k), by how much they move the pixels (RMS)."""
+
+    fit: Robust
+    theta: np.ndarray
+    sd: float
+    moved_px: float
+    raw: float  # gain in log likelihood, theta integrated out
+
+    @property
+    def in_most(self) -> bool:
+        """Whether they differ from 0 in most frames."""
+        size2 = (self.theta**2).sum(axis=1)
+        return bool(np.median(size2) > _MOST**2 * size2.mean())
+
+
+def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float) -> _Numbers:
+    """Numbers of the frames that move the pixels by columns(M) (n, 2, 2, k) theta; `sd` is a first guess."""
+    problem = moved = case.problem
+    fit = case.null
+    for _ in range(_ROUNDS):
+        D, shape = columns(fit.M), fit.shapes[0]
+        k, r2 = D.shape[3], (fit.residuals**2).sum(axis=2) / problem.noise**2
+        weight = np.where(problem.used, (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2) / problem.noise**2, 0.0)
+        left = np.nan_to_num(problem.y - moved.y + fit.residuals)  # by cameras without these numbers
+        H, b = np.zeros((case.frames, k, k)), np.zeros((case.frames, k))
+        np.add.at(H, problem.frame, np.einsum("nc,ncia,ncib->nab", weight, D, D))
+        np.add.at(b, problem.frame, np.einsum("nc,ncia,nci->na", weight, D, left))
+        for _ in range(_STEPS):
+            C = np.linalg.inv(H + np.eye(k) / sd**2)
+            theta = (C @ b[..., None])[..., 0]
+            sd = max(float(np.sqrt((theta**2 + np.diagonal(C, axis1=1, axis2=2)).mean())), 1e-6)
+        shift = np.einsum("ncia,na->nci", D, theta[problem.frame])
+        moved = replace(problem, y=problem.y - shift)
+        fit = moved.fit(start=fit.start, rounds=5)
+    chosen = 0.5 * float(np.linalg.slogdet(np.eye(k) + sd**2 * H)[1].sum() + ((theta / sd) ** 2).sum())
+    moved_px = float(np.sqrt((shift**2).sum(axis=2)[problem.used & (shift != 0).any(axis=2)].mean()))
+    return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
+
+
+#: They need nothing but the rows, and the tool's path in time where there is one.
+FRAME_TESTS = (rigid_tips, unsteady_robot, unsteady_images)
