@@ -1,8 +1,8 @@
 """What is wrong with a recording: hypotheses fitted to its correspondences, and compared with "nothing is wrong".
 
-Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`, those of what changes
-from frame to frame in `lib.trust.unsteady`.  Each is fitted under heavy-tailed noise (`lib.trust.fitting`).  Its gain in log likelihood, less a penalty for its parameters (BIC), is its
-evidence.
+Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`, those of numbers that
+each frame has for itself in `lib.trust.unsteady`.  Each is fitted under heavy-tailed noise (`lib.trust.fitting`).  Its gain
+in log likelihood, less a penalty for its parameters (BIC), is its evidence.
 """
 
 from collections import ChainMap

@@ -305,8 +305,8 @@ class Case:
     """
 
     def __init__(
-        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None,
-        robot_accuracy_mm: float,
+        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float,
+        size: tuple[int, int] | None, robot_accuracy_mm: float,
     ) -> None:  # fmt: skip
         self.problem, self.kinematics, self.readout_s, self.size = problem, kinematics, readout_s, size
         self.robot_mm = max(_LEAST_ROBOT_MM, _TIMES * robot_accuracy_mm)
