@@ -82,13 +82,14 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     """A wrong frame rate, or frames in reverse; one that is far off is sought only where the residuals are large."""
     rate, shift = 1.0, 0.0
     if case.misfit(case.null, *case.fits.values()) >= FITS:
-        scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in (1.0, *_RATES)}
+        # Clocks of other rates may have started together, half the span before its middle.
+        scans = {rate: _scan(case, (0.2 + abs(abs(rate) - 1) / 2) * case.paths.span_s, rate) for rate in (1.0, *_RATES)}
         rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
         trial, misfit = scans[rate]
         shift = float(trial[misfit.sum(axis=1).argmin()])
     if (fitted := _refined(case, shift, (0, 1), rate)) is None:
         return
-    fit, problem, (_, value), (_, sd) = fitted
+    fit, problem, (shift, value), (shift_sd, sd) = fitted
     if abs(value) > _FAR_OFF and case.misfit(fit) >= FITS:  # some path or other passes near a part of the frames
         return
     if rate < 0:
@@ -97,6 +98,9 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     elif abs(value) >= max(5.0 * sd, 1e-3):
         text = f"In one second of the video's time {1 + value:.4f} +- {sd:.4f} s of the robot's pass."
         cure = f"Multiply fps in recording.toml by {1 / (1 + value):.4f}, or write the frames' true times to frames.csv."
+        shift -= value * np.median(case.problem.time)
+        if abs(shift) > 5.0 * np.hypot(shift_sd, sd * np.median(case.problem.time)):
+            cure += f" Add {shift:.4f} to offset_s as well."
         yield case.found("clock_rate", fit, 4, (1 + value, sd, "times"), text, cure, on=problem)
 
 

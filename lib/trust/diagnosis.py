@@ -19,18 +19,21 @@ from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
-from lib.trust.optics import axes_and_eyes, finite_distance, lens
+from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
 from lib.trust.unsteady import FRAME_TESTS, is_constant
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
+_LEAST_LENGTH_MM = 1.0  # which no tool calibration errs by
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _BENDS = 1.5  # standard deviations that the detector states of the base, below which it moves as tips of a bent tool do
 _UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
+_OF_TIME = ("clock", "clock_rate", "frame_order")
+_NEARLY = 0.05  # of the residuals, by which one cause may explain more without being likelier
 _MOSTLY = 0.5  # of the residuals, which a named cause explains
 _OUTSIDE = 0.25  # of the frames; a log that begins late has fewer, and cameras fit
 _STILL_PX, _STILL_MM = 0.3, 0.04  # detections of one picture, and a robot that rests, differ by less
@@ -56,6 +59,8 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved, images=views)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
+    if not own.any():  # it only found better cameras than `null`
+        return
     text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
     cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
     raw = fit.total - case.null.total - case.frames * np.log(2.0)
@@ -74,6 +79,17 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
         certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # cameras with offsets have no residuals of them
         yield replace(found, gain=max(found.gain, float(certainty)), explained=float(1.0 - _LEAST_OFFSET_UM / size))
+
+
+def _tool_length(case: Case) -> Iterator[Hypothesis]:
+    """All landmarks beside where the robot reports them, alike: it reports another point of the tool."""
+    fit = case.problem.fit(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], case.problem.axes))
+    size_mm, sd_mm = float(np.linalg.norm(fit.theta)), float(np.sqrt(np.trace(fit.covariance)))
+    if size_mm - 2.0 * sd_mm > _LEAST_LENGTH_MM:
+        along = ", ".join(f"{v:.2f}" for v in fit.theta)
+        text = f"All landmarks lie {size_mm:.1f} mm from where the robot reports them ({along} mm in the tool's axes)."
+        cure = "Does the robot report its flange? Tell it the tool's length, or add it to all columns of kinematics.csv."
+        yield case.found("landmark_offset", fit, 3, (1e3 * size_mm, 1e3 * sd_mm, "um"), text, cure)
 
 
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
@@ -279,6 +295,16 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
 
 
+def _plainest(found: list[Hypothesis]) -> list[Hypothesis]:
+    """A cause that explains nearly as much goes before one with numbers for each frame, and a clock before its rate."""
+    causes = [h for h in found if h.is_named]
+    for name, rivals in (("robot_noise", {h.name for h in causes} - {"robot_noise"}), ("clock_rate", {"clock"})):
+        own = max((h.explained for h in causes if h.name == name), default=0.0)
+        most = max((h.gain for h in causes if h.name in rivals and h.explained > own - _NEARLY), default=np.inf)
+        found = [replace(h, gain=min(h.gain, 0.9 * most)) if h.name == name else h for h in found]
+    return found
+
+
 def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s: float) -> list[Hypothesis]:
     """A clock so far off that the robot's log is of another time than many frames."""
     time = np.unique(data.time_s[data.seen.any(axis=1)]) + offset_s
@@ -354,17 +380,21 @@ def diagnose(
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
-    tests = [_tip_order, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
+    tests = [_tip_order, _tool_length, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, *FRAME_TESTS]
     found = compared([h for test in tests for h in test(whole if test is _frozen else case)])
-    if case.misfit(case.null, case.fits.get("clock", case.null)) >= FITS:
+    if case.misfit(case.null, *(case.fits[name] for name in _OF_TIME if name in case.fits)) >= FITS:
         found += apart
-    best = Diagnosis(found := [h for h in found if np.isfinite(h.gain)]).best
+    best = Diagnosis(found := _plainest([h for h in found if np.isfinite(h.gain)])).best
     if best is None:  # other faults look like offsets, too
         found += _landmark_offset(case)
         best = Diagnosis(found).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
+    if turned and not stands_exchanged(fit):
+        found = [h for h in found if h.name != "turned_image"]
+        best, turned = Diagnosis(found).best, False
+        fit = case.null if best is None else case.fits.get(best.name, case.null)
     more = [] if near else list(finite_distance(case, fit))
     more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
     if best is not None and best.explained > _MOSTLY:  # a fault of this size may skew the pixels; the next check tells

@@ -1,6 +1,6 @@
 """Hypotheses about the lenses, the robot's axes, and which eye is which."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,8 @@ _FIT_SHARE = 0.3  # of the landmarks in each image that must lie near where came
 _DISTORTION_SD = 0.04  # at the corner, before the data
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
+_INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
+_SURE_CURVED = 8.0  # stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 #: Which the residuals do not show.
 BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
@@ -30,8 +32,10 @@ BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_image
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
     """A perspective that an affine camera has not, beside the best cause so far."""
     value, sd = fit.nearness
-    far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
-    text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
+    if value <= 0:  # `_handedness` says what that means
+        return
+    text = f"The residuals are curved by a working distance of {1 / value:.0f} mm: "
+    text += f"1/distance is {value:.5f} +- {sd:.5f} per mm."
     cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
     n = 2.0 * case.problem.used.sum()
     beside = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald's test as a ratio of likelihoods
@@ -72,9 +76,10 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     if (misfit := max(case.misfit(fit), *each)) < FITS:
         # Pixels cannot tell x from y; and where cameras fit without that cause, their pixels must be implausible, too.
         told = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
-        yield from list(_jaws(case)) or (_scaled_axis(A, covariance) if told else ())
+        accused, refuted = _jaws(case)
+        yield from accused or (h for h in _scaled_axis(A, covariance) if told and not refuted(h))
     if misfit < 2 * FITS:  # nor do they tell left from right
-        yield from _handedness(case, A, covariance)
+        yield from _handedness(case, A, covariance, fit.nearness)
 
 
 def _of_axes(fit: Robust, sign: float) -> tuple[np.ndarray, np.ndarray]:
@@ -90,16 +95,17 @@ def _constraints(A: np.ndarray) -> np.ndarray:
     return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
-def _jaws(case: Case) -> Iterator[Hypothesis]:
+def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[Hypothesis], bool]]:
     """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
 
     If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
+    Returns what that shows, and whether it refutes another accusation.
     """
     x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
     jaws = x[:, 1:] - x[:, :1]
     squares = (jaws**2).sum(axis=2, keepdims=True)
     if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
-        return
+        return [], lambda other: False
     opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
     n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
     # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
@@ -110,18 +116,29 @@ def _jaws(case: Case) -> Iterator[Hypothesis]:
     rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)  # what the opening leaves
     length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
     along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
+    slopes, squared, enough = common / along, (n**2).mean(axis=(0, 1)), turns.std(axis=0) >= _TURNED
+    sums = [part.sum(axis=0) for part in np.array_split(turns * (length[:, None] - slopes * turns), _PARTS)]  # errors last
+    sds = np.hypot(np.linalg.norm(sums, axis=0) / along, _OWN_SD)
+
+    def refuted(other: Hypothesis) -> bool:
+        """Whether the slope that an axis of such a scale makes is not there, though the jaws turn enough to show it."""
+        j = "xyz".index(other.text.split("robot's ")[1][0])
+        q = 1.0 - other.value**-2.0
+        due = -q / (1.0 - q * squared[j])
+        return bool(enough[j] and abs(slopes[j]) < abs(due) / 2 and abs(due - slopes[j]) > _SURE_SCALED * sds[j])
+
     k = (common**2 / along).argmax()
-    slope, total = common[k] / along[k], length @ length
+    slope, sd, total = slopes[k], float(sds[k]), length @ length
     # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
     left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
-    sums = [part.sum() for part in np.array_split(turns[:, k] * left, _PARTS)]  # errors last for a while
-    sd = float(np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD))
     most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
-    if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
-        scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
+    found = []
+    if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and enough[k] and left @ left <= most:
+        scale = float((1 - slope / (slope * squared[k] - 1)) ** -0.5)
         text = f"The jaw lengths change with direction. They would not if the robot's {'xyz'[k]} were divided by {scale:.3f}."
         size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
-        yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
+        found = [Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))]
+    return found, refuted
 
 
 def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
@@ -143,7 +160,9 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     for free in np.array([[0, 0, 1, 1], [0, 0, 1, 0], [0, 0, 0, 1]]):  # the log aspect of both images, or of one
         resized = min(resized, none - float((free @ information @ stated) ** 2 / (free @ information @ free)))
     for name, values in zip("xyz", misfit, strict=True):
-        best = int(values[1:-1].argmin()) + 1
+        best = int(values.argmin())
+        if not 0 < best < len(values) - 1:  # no scale mends it
+            continue
         before, least, after = values[best - 1 : best + 2]
         if least > resized + _RATHER_RESIZED:
             continue
@@ -159,32 +178,56 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
 
 
-def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A left camera on the right, or a tool that points at the cameras: exchanged eyes, or something is mirrored."""
+def stands_exchanged(fit: Robust) -> bool:
+    """Whether the left camera of a fit stands on the right."""
+    A, covariance = _of_axes(fit, 1.0)
+    return bool(np.isfinite(covariance).all()) and eyes_exchanged(A.reshape(4, 3), _side(A, covariance)[1])
+
+
+def _side(A: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Along the image rows, where the right camera of A (2, 2, 3), of `covariance` (12, 12), stands, rad, and its deviation."""
+    side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
+    J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
+    return float(side), float(np.sqrt(J @ covariance @ J))
+
+
+def _handedness(
+    case: Case, A: np.ndarray, covariance: np.ndarray, nearness: tuple[float, float]
+) -> Iterator[Hypothesis]:  # fmt: skip
+    """A left camera on the right, or a world that looks mirrored: exchanged eyes, a mirrored axis, or mirrored images.
+
+    Farther things look smaller (`nearness`), unless the world is mirrored.  Where that does not show, a tool that points at
+    the cameras tells: no microscope looks at one from its tips.
+    """
     view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
     base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
     tool = tips.mean(axis=1) - base[:, 0]
     ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # of a tool across the view nearly 0
-    near, far = int((ahead < -_ACROSS).sum()), int((ahead > _ACROSS).sum())
-    side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
-    J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
-    sd = float(np.sqrt(J @ covariance @ J))
+    near, known, (curved, curved_sd) = int((ahead < -_ACROSS).sum()), np.isfinite(ahead).sum(), nearness
+    share = (near - int((ahead > _ACROSS).sum())) / max(known, 1)
+    apart_s = np.ptp(case.problem.time) if np.isfinite(case.problem.time).all() else np.inf
+    if abs(curved) > _SURE_CURVED * curved_sd:
+        mirrored, how = curved < 0, "farther things look larger"
+        gain = 0.5 * (curved / curved_sd) ** 2
+    else:
+        mirrored, how = share > 0.5, f"in {near} of {known} frames the tips lie nearer to the cameras than the base"
+        gain = share * min(known, 1.0 + _INDEPENDENT_HZ * apart_s) * np.log(_UPSIDE_DOWN)
+    side, sd = _side(A, covariance)
     degrees = np.rad2deg(-side)
     size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
     where = f"The left camera stands on the right, by {degrees:.1f} degrees"
     if eyes_exchanged(A.reshape(4, 3), sd):
-        if near > far:
-            text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
+        if mirrored:
+            text = f"{where}, and {how}: an axis of the robot is mirrored."
             cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
             yield Hypothesis("mirrored_axis", text, cure, *size)
         else:
-            text = f"{where}, and the tool points away from it: the eyes are exchanged, or both are turned by 180 degrees."
+            text = f"{where}, and the robot's frame is right-handed: the eyes are exchanged, or both are turned by 180 degrees."
             cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
             yield Hypothesis("exchanged_eyes", text, cure, *size)
-    elif near > far:
-        share = near / (near + far)
-        text = f"In {100 * share:.0f} % of the frames the tips lie nearer to the cameras than the base. If both images are "
-        text += "mirrored, heights and distances have the wrong sign."
-        cure = "Flip both images, and undo what was done to the tips' order. Where the tool does point so, --force goes on."
-        gain = (near - far) * np.log(_UPSIDE_DOWN)
-        yield Hypothesis("mirrored_images", text, cure, 100 * share, 0.0, "%", 2 * share - 1, float(gain))
+    elif mirrored:
+        text = f"The world looks mirrored, since {how}. Then heights and distances have the wrong sign."
+        cure = "Flip both images, and undo what was done to the tips' order; or, if the images are right, use a right-handed "
+        cure += "robot frame and exchange left/ and right/. Where the tool does point so, --force goes on."
+        explained = 1.0 if abs(curved) > _SURE_CURVED * curved_sd else share
+        yield Hypothesis("mirrored_images", text, cure, 100.0 * share, 0.0, "%", explained, float(gain))
