@@ -32,6 +32,7 @@ _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, 
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _BENDS = 1.5  # standard deviations that the detector states of the base, below which it moves as tips of a bent tool do
 _UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
+_OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # of the residuals, by which one cause may explain more without being likelier
 _MOSTLY = 0.5  # of the residuals, which a named cause explains
@@ -398,7 +399,7 @@ def diagnose(
     more = [] if near else list(finite_distance(case, fit))
     more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
     if best is not None and best.explained > _MOSTLY:  # a fault of this size may skew the pixels; the next check tells
-        more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name == "scaled_axis" else h for h in more]
+        more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in _OF_PIXELS else h for h in more]
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))

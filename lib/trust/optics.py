@@ -25,8 +25,10 @@ _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its 
 _INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
 _SURE_CURVED = 8.0  # stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
+_ODD_PIXELS = "The cameras' pixels are skewed or oblong, and no axis of the robot is to blame: the jaws keep their lengths."
+_STEADY = "Look for what changes slowly while you record: microscope, clock, robot. Resized images do no harm."
 #: Which the residuals do not show.
-BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
+BY_GEOMETRY = ("scaled_axis", "odd_pixels", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
 
 
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
@@ -77,7 +79,8 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
         # Pixels cannot tell x from y; and where cameras fit without that cause, their pixels must be implausible, too.
         told = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
         accused, refuted = _jaws(case)
-        yield from accused or (h for h in _scaled_axis(A, covariance) if told and not refuted(h))
+        for h in accused or (_scaled_axis(A, covariance) if told else ()):
+            yield replace(h, name="odd_pixels", text=_ODD_PIXELS, cure=_STEADY, explained=_UNDECIDED) if refuted(h) else h
     if misfit < 2 * FITS:  # nor do they tell left from right
         yield from _handedness(case, A, covariance, fit.nearness)
 
@@ -121,7 +124,7 @@ def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[Hypothesis], bool]]:
     sds = np.hypot(np.linalg.norm(sums, axis=0) / along, _OWN_SD)
 
     def refuted(other: Hypothesis) -> bool:
-        """Whether the slope that an axis of such a scale makes is not there, though the jaws turn enough to show it."""
+        """Of an axis by its pixels: whether the slope that an axis of such a scale makes is not there, though the jaws turn enough to show it."""
         j = "xyz".index(other.text.split("robot's ")[1][0])
         q = 1.0 - other.value**-2.0
         due = -q / (1.0 - q * squared[j])
