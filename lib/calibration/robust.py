@@ -153,7 +153,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
 
 def _extent(u: np.ndarray) -> np.ndarray:
     """(2,) width and height of the pixels, whatever one row in ten does."""
-    low, high = np.quantile(u, [0.1, 0.9], axis=0)
+    low, high = np.transpose([np.interp([0.1, 0.9], np.linspace(0, 1, len(u)), np.sort(one)) for one in u.T])
     return np.maximum((high - low) / 0.8, 1e-9)
 
 
@@ -161,10 +161,13 @@ def _sampled(H: np.ndarray, u: np.ndarray, count: int, rng: np.random.Generator,
     """Cameras (count, 4, 2) of H (n, 4) and u (n, 2), each through four points that span a large volume."""
     n, x = len(H), H[:, :3]
     sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
-    sets = sets[np.argsort(-np.abs(np.linalg.det(x[sets[:, 1:]] - x[sets[:, :1]])))[:count]]  # of the largest volume
-    corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
-    thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
-    spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
+    volume = np.abs(np.linalg.det(x[sets[:, 1:]] - x[sets[:, :1]]))
+    sets, volume = (of_sets[np.argsort(-volume)[:count]] for of_sets in (sets, volume))  # of the largest volume
+    corners, least = x[sets] - x[sets].mean(axis=1, keepdims=True), 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
+    thick = volume / np.maximum((corners**2).sum(axis=(1, 2)), 1e-300)  # at least
+    thin = thick <= max(least, least_mm)
+    thick[thin] = np.sqrt(np.maximum(np.linalg.eigvalsh(corners[thin].mT @ corners[thin])[:, 0], 0.0))
+    spans = thick > least
     if not spans.any():
         raise DataError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
     sets, thick = sets[spans], thick[spans]
@@ -175,8 +178,9 @@ def _sampled(H: np.ndarray, u: np.ndarray, count: int, rng: np.random.Generator,
 
 def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
     """Squared distances (k, n) of pixels u (n, 2) to the projections of H (n, 4) by cameras M (k, 4, 2)."""
-    x, y = (M[:, :, axis] @ H.T - u[:, axis] for axis in (0, 1))  # each is far quicker than an axis of two
-    return x * x + y * y
+    r = (M.transpose(2, 0, 1).reshape(-1, 4) @ H.T).reshape(2, len(M), len(H))
+    r -= u.T[:, None]
+    return r[0] ** 2 + r[1] ** 2
 
 
 def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
@@ -275,7 +279,7 @@ def _mixture(
         G = moments[:, :16].reshape(k, 4, 4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
         distance2 = _distances2(H, u, M)
-        mass, squares = p.sum(axis=2), (p * distance2).sum(axis=2)
+        mass, squares = p.sum(axis=2), np.einsum("ckn,kn->ck", p, distance2)
         # The camera's eight numbers are paid for by the pixels that weigh in it.
         paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[0] / variance[1])
         first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
