@@ -114,7 +114,7 @@ def calibrate(
             found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, rows.frame, prior_sd=offset_prior_sd)
-        found = estimate(axes=None if axes is None else lambda offset: axes)
+        found = estimate(axes=axes)
         if axes is not None:
             found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
     if usable is None:
@@ -185,7 +185,7 @@ def _turned(
     row = np.unique(data.frame, return_inverse=True)[1][usable]
 
     def turned(offset: np.ndarray) -> np.ndarray:
-        own = tool_axes(x_mm, np.vstack([offset, np.zeros((3 - len(offset), 3))]))[row]
+        own = tool_axes(x_mm, offset)[..., row, :, :]
         return np.where(np.isfinite(own), own, axes)
 
     opening = np.linalg.norm(x_mm[row, 2] - x_mm[row, 1], axis=1)

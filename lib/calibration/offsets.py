@@ -35,6 +35,8 @@ _TAKEN = 4
 _GRID_MM, _STARTING_ROWS = (0.0, 0.2, -0.2), 2000
 #: How many starts take more steps, how often rows are weighed anew for a step, and the gain in cost of the last step.
 _POLISHED, _REWEIGHTED, _SETTLED = 4, 3, 0.1
+#: The tool's axes (n, 3, 3) in the rows; of offsets (..., landmarks, 3), if these turn them, (..., n, 3, 3); or none.
+Axes = np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
 class Unsettled(RuntimeWarning):
@@ -44,8 +46,9 @@ class Unsettled(RuntimeWarning):
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
-    With `offset_mm` (3, 3), the axes of the landmarks moved by it in these same axes.  Tips that are reported crossed leave
-    two; those that turn least from row to row count, so the rows must be in order of time.
+    With `offset_mm` (..., 3, 3), the axes (..., n, 3, 3) of the landmarks moved by it in these same axes; of fewer landmarks,
+    the others stay.  Tips that are reported crossed leave two; those that turn least from row to row count, so the rows must
+    be in order of time.
     NaN where the tips are reported closer than 5 % of the tool's length, or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
@@ -67,31 +70,33 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
             return np.where((width > 0.05 * size[:, None])[:, :, None], np.stack([m, c, g], axis=2), np.nan)
         # In the tool's axes the reported vector along the tool is known but for its length; so is the height, along the
         # normal, of the one from tip to tip.  Together they are all three angles.
-        middle, apart = (offset_mm[1] + offset_mm[2]) / 2 - offset_mm[0], offset_mm[2] - offset_mm[1]
-        straight = np.sqrt(size**2 - middle[1] ** 2 - middle[2] ** 2)
-        a = np.column_stack([straight, np.full((len(x), 2), -middle[1:])]) / size[:, None]
-        up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
-        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        base, tip_1, tip_2 = (*np.moveaxis(offset_mm[..., None, :], -3, 0), np.zeros(3), np.zeros(3))[:3]  # (..., 1, 3)
+        middle, apart = (tip_1 + tip_2) / 2 - base, tip_2 - tip_1
+        straight = np.sqrt(size**2 - middle[..., 1] ** 2 - middle[..., 2] ** 2)
+        a = np.stack(np.broadcast_arrays(straight, -middle[..., 1], -middle[..., 2]), axis=-1) / size[:, None]
+        up = np.array([0.0, 0.0, 1.0]) - a[..., 2:] * a
+        up /= np.linalg.norm(up, axis=-1, keepdims=True)
         side = cross(up, a)
-        sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
-        cosine = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2)
-        own = np.stack([a, side, up], axis=2)
+        sine = np.clip((-apart[..., 2:] - beside * a[..., 2:]) / (width * up[..., 2:]), -1, 1)
+        cosine = np.multiply.outer([1.0, -1.0], np.sqrt(1 - sine**2))
+        own = np.stack([a, side, up], axis=-1)
         y, z = cosine * c - sine * g, sine * c + cosine * g
-        axes = np.stack([[m, m], y, z], axis=3) @ own.mT  # (2, n, 3, 3)
-        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
-        shut = 0.05 * (straight + middle[0])
-        possible = (width[:, 0] > shut) & (opening > np.stack([np.full(len(x), -np.inf), -shut]))  # jaws hardly cross
-    return _least_turning(axes, possible)
+        axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=-1) @ own.mT  # (2, ..., n, 3, 3)
+        opening = apart[..., 1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
+        shut = 0.05 * (straight + middle[..., 0])
+        possible = (width[:, 0] > shut) & (opening > np.stack([np.full(shut.shape, -np.inf), -shut]))  # jaws hardly cross
+    found = np.where(possible[0, ..., None, None], axes[0], np.where(possible[1, ..., None, None], axes[1], np.nan))
+    for of_one in np.argwhere(possible.all(axis=0).any(axis=-1)).tolist():
+        one = (slice(None), *of_one)
+        _choose_least_turning(axes[one], possible[one], found[one[1:]])
+    return found
 
 
-def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
-    """Of two axes (2, n, 3, 3) of each tool the `possible` (2, n) ones that turn least, else the first; NaN without any."""
-    found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
-    found[known] = np.where(possible[0, known, None, None], axes[0, known], axes[1, known])
+def _choose_least_turning(axes: np.ndarray, possible: np.ndarray, found: np.ndarray) -> None:
+    """Where two axes (2, n, 3, 3) are `possible` (2, n), write those that turn least into those `found` (n, 3, 3)."""
+    known = np.flatnonzero(possible.any(axis=0))
     two = np.concatenate([[False], possible[:, known].all(axis=0), [False]])
     known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter
-    if not known.size:
-        return found
     y = axes[..., 1][:, known]
     own = np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
     turn = np.nan_to_num(1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:]), nan=np.inf).tolist()
@@ -103,7 +108,6 @@ def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     for step in reversed(came):
         which.append(step[which[-1]])
     found[known] = axes[np.array(which[::-1], int), known]
-    return found
 
 
 def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, carry: bool = False) -> np.ndarray:
@@ -118,7 +122,7 @@ def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, car
     axes = tool_axes(x)
     axes = carried(axes, x) if carry else axes
     if offset_mm is not None:
-        turned = tool_axes(x, np.vstack([offset_mm, np.zeros((3 - len(offset_mm), 3))]))
+        turned = tool_axes(x, offset_mm)
         turned = carried(turned, x) if carry else turned
         axes = np.where(np.isfinite(turned), turned, axes)
     return axes[np.unique(data.frame, return_inverse=True)[1]]
@@ -161,15 +165,14 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 def estimate_offsets(
     fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
-    axes: Callable[[np.ndarray], np.ndarray] | None = None, prior_sd: float | None = None, iterations: int = 20,
-    start: Calibration | None = None,
+    axes: Axes = None, prior_sd: float | None = None, iterations: int = 20, start: Calibration | None = None,
 ) -> Calibration:  # fmt: skip
     """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
     pixels (n, m) with the `views` to use, and one Schur complement; an `Unsettled` warning where `iterations` are too few.
-    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
-    prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
+    `start` gives the first offsets, their prior and p-value.  Without `prior_sd` it is the one that makes the data most
+    probable, 0.1 to 300 um or 0.01 to 30 px.
     Where rows agree loosely or two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may
     explain it; else the `NoConsensusError`, or the calibration without that landmark, stays.
     """
@@ -203,8 +206,7 @@ def _agree_alike(found: Calibration, landmark: np.ndarray) -> bool:
 
 def _steps(
     fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
-    axes: Callable[[np.ndarray], np.ndarray] | None, prior_sd: float | None, iterations: int, start: Calibration | None, *,
-    taken: int = 0,
+    axes: Axes, prior_sd: float | None, iterations: int, start: Calibration | None, *, taken: int = 0,
 ) -> Calibration:  # fmt: skip
     """`estimate_offsets`; the first steps, as many as `taken`, use every detection, though they look like two cameras'."""
     offset = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3))
@@ -214,7 +216,7 @@ def _steps(
     step, share, before_px = np.zeros(offset.size), 1.0, np.inf
 
     for i in range(iterations):
-        own = np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes(offset)
+        own = axes(offset) if callable(axes) else np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes
         shift = np.einsum("nij,nj->ni", own, offset[landmark])
         if i < taken:
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
@@ -275,33 +277,33 @@ def start_of_turning(
     prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
 
     def of_rows(offset: np.ndarray) -> np.ndarray:
-        return turned(offset)[rows]
+        return turned(offset)[..., rows, :, :]
 
-    def from_here(offset: np.ndarray, *, held: bool = False) -> tuple[float, np.ndarray]:
+    def from_here(offset: np.ndarray, own: np.ndarray | None = None) -> tuple[float, np.ndarray]:
         """How badly offsets explain the detections, with the cameras free, and where a Gauss-Newton step leads.
 
-        The step leaves the turn as it is if that is `held`.  Rows whose axes stay wrong are far off, and count little: the
-        noise is Student's, of 4 degrees of freedom.
+        The step leaves the turn as it is where the axes are given as their `own`.  Rows whose axes stay wrong are far off,
+        and count little: the noise is Student's, of 4 degrees of freedom.
         """
-        own = of_rows(offset)
+        held, own = own is not None, of_rows(offset) if own is None else own
         left = r - (J_x @ own @ offset[landmark][:, :, None])[:, :, 0]
-        J, w = np.concatenate([J_c, J_x @ _by_offset(of_rows, offset, landmark, own, fixed=held)], axis=2), weight
+        J = np.concatenate([J_c, J_x @ _by_offset(None if held else of_rows, offset, landmark, own)], axis=2)
+        flat, weighted, likely = J.reshape(-1, J.shape[2]), (weight @ J).reshape(-1, J.shape[2]), np.ones(len(r))
         for _ in range(_REWEIGHTED):
-            weighted = (w @ J).reshape(-1, J.shape[2])
-            information, gradient = weighted.T @ J.reshape(weighted.shape), weighted.T @ left.ravel()
+            now = weighted * np.repeat(likely, r.shape[1])[:, None]
+            information, gradient = now.T @ flat, now.T @ left.ravel()
             rest = left - J_c @ np.linalg.solve(information[:p, :p], gradient[:p])
-            r2 = (rest[:, None] @ weight @ rest[:, :, None])[:, 0, 0]
+            r2 = (rest * (weight @ rest[:, :, None])[:, :, 0]).sum(axis=1)
             median = max(np.median(r2), 1e-12)
-            w = weight / (1 + r2 / median)[:, None, None]
+            likely = 1 / (1 + r2 / median)
         information[p:, p:] += prior + held * 1e3 * np.trace(information) * turns.T @ turns
         step = np.linalg.solve(information, gradient - np.append(np.zeros(p), prior @ offset.ravel()))[p:]
         cost = len(r) * np.log(median) + 2 * np.log1p(r2 / median).sum()
         return float(cost), offset + step.reshape(offset.shape)
 
-    starts = []
-    for turn in product(_GRID_MM, repeat=3):
-        offset = from_here(np.tensordot(turn, along, 1), held=True)[1]
-        starts.append((from_here(offset, held=True)[0], offset))
+    grid = np.tensordot(list(product(_GRID_MM, repeat=3)), along, 1)
+    grid = np.stack([from_here(*one)[1] for one in zip(grid, of_rows(grid), strict=True)])
+    starts = [(from_here(*one)[0], one[0]) for one in zip(grid, of_rows(grid), strict=True)]
     best = min(starts, key=lambda start: start[0])
     for _, offset in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
         (cost, to), share = from_here(offset), 1.0
@@ -328,16 +330,14 @@ def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
     return rows, np.linalg.pinv(rows).T.reshape(3, k, 3)
 
 
-def _by_offset(
-    axes: Callable[[np.ndarray], np.ndarray] | None, offset: np.ndarray, landmark: np.ndarray, own: np.ndarray, *,
-    fixed: bool = False,
-) -> np.ndarray:  # fmt: skip
-    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes `own`, unless `fixed`."""
+def _by_offset(axes: Axes, offset: np.ndarray, landmark: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes `own` as `axes` say."""
     k, m = offset.shape
     J = np.einsum("nij,nk->nikj", own, np.eye(k)[landmark]).reshape(-1, m, k * m)
-    for turn, along in () if axes is None or fixed else zip(*_turns(k), strict=True):
-        turning = (axes(offset + _STEP * along) - axes(offset - _STEP * along)) / (2 * _STEP)
-        J = J + np.einsum("nij,nj->ni", turning, offset[landmark])[:, :, None] * turn
+    if callable(axes):
+        turns, along = _turns(k)
+        more, less = axes(offset + _STEP * np.stack([along, -along]))
+        J = J + np.einsum("tnij,nj->nit", (more - less) / (2 * _STEP), offset[landmark]) @ turns
     return J
 
 

@@ -359,7 +359,7 @@ def test_too_few_steps_are_told():
     with pytest.warns(Unsettled, match=r"offsets: they still move by up to .* mm after 1 steps"):
         estimate_offsets(
             lambda x, y, views: calibrate(x, [y[:, :2], y[:, 2:]]),
-            data.x_mm, y, data.landmark, data.frame, lambda offset: axes, iterations=1,
+            data.x_mm, y, data.landmark, data.frame, axes, iterations=1,
         )
 
 
