@@ -55,7 +55,11 @@ class TipDistance:
         self._predict(result.time_s, x_mm)
         self._seen_s = result.time_s if np.isfinite(seen).any() else self._seen_s
         if result.state == "tracking":
-            self._correct(seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence)
+            gap, noise = seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence
+            for k in np.flatnonzero(np.isfinite(gap).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))):
+                gain = self._covariance[k] @ np.linalg.inv(self._covariance[k] + noise[k])
+                self._correction[k] += gain @ (gap[k] - self._correction[k])
+                self._covariance[k] = (np.eye(3) - gain) @ self._covariance[k]
         x = np.where(robot[:, None], x_mm + self._correction, seen)
         own = self._covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
         covariance = np.where(robot[:, None, None], own, covariance)
@@ -108,9 +112,3 @@ class TipDistance:
                 before = self._velocity[k] if np.isfinite(self._velocity[k]).all() else now
                 self._velocity[k] = before + (1.0 - np.exp(-step_s[k] / _SMOOTH_S)) * (now - before)
             self._x[k], self._moved_s[k] = x_mm[k], time_s
-
-    def _correct(self, gap: np.ndarray, noise: np.ndarray) -> None:
-        for k in np.flatnonzero(np.isfinite(gap).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))):
-            gain = self._covariance[k] @ np.linalg.inv(self._covariance[k] + noise[k])
-            self._correction[k] += gain @ (gap[k] - self._correction[k])
-            self._covariance[k] = (np.eye(3) - gain) @ self._covariance[k]

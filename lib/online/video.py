@@ -30,18 +30,15 @@ class Dashboard:
         u = np.stack([result.landmarks.u_left, result.landmarks.u_right])
         views = overlay(StereoFrame(left, right, result.time_s), u, None, min(637, 360 * left.shape[1] // left.shape[0]))
         page[: views.shape[0], : views.shape[1]] = views
-        self._lights(page, result)
-        self._past.append((result.distance_mm, result.distance_sd_mm))
-        self._curve(page[420:, :860])
-        self._times(page[420:, 880:], result)
-        return page
-
-    def _lights(self, page: np.ndarray, result: FrameResult) -> None:
         for i, (state, colour) in enumerate(_LIGHTS.items()):
             on, at = state == result.state, (30 + 150 * i, 390)
             cv2.circle(page, at, 10, colour if on else (215, 215, 215), -1, cv2.LINE_AA)
             _text(page, state, (at[0] + 16, at[1] + 5), (0, 0, 0) if on else (160, 160, 160))
         _text(page, f"{result.time_s:8.2f} s  {result.cause}"[:44], (930, 395))
+        self._past.append((result.distance_mm, result.distance_sd_mm))
+        self._curve(page[420:, :860])
+        self._times(page[420:, 880:], result)
+        return page
 
     def _curve(self, part: np.ndarray) -> None:
         past = np.array(self._past)  # (n, 2, 3)

@@ -52,7 +52,8 @@ class Shape:
         freedom, share = tried[:, None], (tried[:, None] + 2.0) / (2.0 * len(r2))
         s2 = np.full(freedom.shape, before.scale if before else max(np.sqrt(np.median(r2)), _LEAST_PX)) ** 2
         for _ in range(4):
-            s2 = np.maximum(share * (s2 * (r2 / (freedom * s2 + r2)).sum(axis=1, keepdims=True)), _LEAST_PX**2)
+            most = freedom * s2 + r2
+            s2 = np.maximum(share * s2 * np.divide(r2, most, out=most).sum(axis=1, keepdims=True), _LEAST_PX**2)
         likelihood = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1)
         best = likelihood.argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(freedom[best, 0])), float(likelihood[best])
@@ -64,7 +65,7 @@ class Shape:
         True
         """
         s2, freedom = self.scale**2, self.freedom
-        return -np.log(2.0 * np.pi * s2) - (freedom + 2.0) / 2.0 * np.log1p(r2 / (freedom * s2))
+        return np.log1p(r2 / (freedom * s2)) * (-0.5 * (freedom + 2.0)) - np.log(2.0 * np.pi * s2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,8 +272,8 @@ class Problem:
 def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
     """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels `from_centre` of the image, of positions x (..., n, 2, 3)."""
     normal = cross(M[:, 0, :3], M[:, 1, :3])
-    normal /= np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-12)
-    return -(x * normal).sum(axis=-1, keepdims=True) * from_centre
+    normal /= -np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-12)
+    return np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre
 
 
 @dataclass(frozen=True)
