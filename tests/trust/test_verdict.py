@@ -18,6 +18,7 @@ from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies import spoiling
 from notebooks.studies.simulated_rows import simulate_correspondences
+from tests.remembering import remembering_recordings
 
 CLOCK = Reason("clock", "not trustworthy", "183 ms", "Set offset_s.")
 FEW = Reason("few_frames", "doubtful", "5 frames", "Record more.")
@@ -136,7 +137,14 @@ def test_a_refusal_names_its_own_cure():
     assert "cover a few depths as well" in reason.text
 
 
-def test_careless_labels_are_looked_at_again_and_no_detector_is_taught():
+@pytest.fixture(scope="module")
+def decoded_once():
+    """The images of the recording that ships."""
+    with remembering_recordings():
+        yield
+
+
+def test_careless_labels_are_looked_at_again_and_no_detector_is_taught(decoded_once):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     truth, rng = recording.truth, np.random.default_rng(3)
     u = np.stack([truth.u_left, truth.u_right])
@@ -189,7 +197,7 @@ def test_data_of_frames_that_the_recording_lacks_are_refused():
         assess(recording, made(60))
 
 
-def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(monkeypatch):
+def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(decoded_once, monkeypatch):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
     late = data.frame >= len(recording) // 2
