@@ -17,7 +17,7 @@ from torch import Tensor
 from lib.adapt import teacher
 from lib.calibration import estimate
 from lib.landmarks import detector
-from lib.recordings import frames
+from lib.recordings import Recording, frames
 from lib.trust import verdict
 from lib.trust.fitting import Problem
 
@@ -91,8 +91,11 @@ def remembering_teacher() -> Iterator[None]:
 
 @contextmanager
 def remembering_recordings() -> Iterator[None]:
-    """In here an image file that stays as it is is decoded once, and the faults of the same rows are sought once."""
+    """In here an image file that stays as it is is decoded once; the faults of the same rows are sought once, and so are the
+    features of the same images.
+    """
     read, known = frames.read_image, {}
+    match, matched = verdict.feature_matches, {}
 
     def read_once(path: Path, *how: object) -> np.ndarray:
         if not path.is_file():
@@ -104,7 +107,19 @@ def remembering_recordings() -> Iterator[None]:
             known[key].setflags(write=False)
         return known[key]
 
+    def match_once(recording: Recording, numbers: np.ndarray) -> np.ndarray:
+        digest = hashlib.sha256()
+        for number in numbers:
+            pair = recording.frames[int(number)]
+            digest.update(repr(pair.left.shape).encode() + pair.left.tobytes() + pair.right.tobytes())
+        key = digest.digest()
+        if key not in matched:
+            matched[key] = match(recording, numbers)
+            matched[key].setflags(write=False)
+        return matched[key]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frames, "read_image", read_once)
+        patch.setattr(verdict, "feature_matches", match_once)
         patch.setattr(verdict, "diagnose", remembering(verdict.diagnose))
         yield

@@ -85,7 +85,7 @@ def test_a_doubled_frame_does_not_block_the_calibration(order):
 def test_one_bad_frame_never_blocks_the_calibration(bad, at):
     world = World(3, NOISE_PX)
     pipeline, results = make(world, settings=SELDOM), []
-    for i in range(40):
+    for i in range(30):
         told = world.advance()
         pipeline._detector = world.detect
         if i == at and bad == "absurd pixels":

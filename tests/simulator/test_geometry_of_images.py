@@ -78,7 +78,7 @@ def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) 
 
 
 def test_visible_tips_lie_on_the_boundary_of_the_rendered_tool():
-    distance_px, visibility = tip_distances(np.random.default_rng(0), 150)
+    distance_px, visibility = tip_distances(np.random.default_rng(0), 90)
     assert (visibility == 2).mean() > 0.85
     assert distance_px[visibility == 2].max() <= 0.25
 
@@ -94,7 +94,7 @@ def test_a_tip_behind_its_own_blunt_jaw_counts_as_hidden():
 def test_base_is_midway_between_the_edges_of_the_shaft():
     rng = np.random.default_rng(1)
     seen = 0
-    for i in range(40):
+    for i in range(24):
         forceps = random_forceps(rng)
         pose = replace(
             random_pose(rng, forceps),
@@ -118,7 +118,7 @@ def test_base_is_midway_between_the_edges_of_the_shaft():
         inside = offsets[profile > 0.5]
         assert abs(inside.min() + inside.max()) / 2 <= 0.25
         assert_allclose(np.ptp(inside), 2 * forceps.shaft_radius_mm * np.linalg.norm(camera.linear[0]), atol=0.5)
-    assert seen > 35
+    assert seen > 20
 
 
 @pytest.mark.parametrize("camera", [RIG.left, NearAffineCamera(RIG.right.matrix, 1 / 150, np.array([959.5, 539.5]))])
