@@ -112,7 +112,8 @@ def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """`np.cross` of vectors (..., 3), which takes several times as long for few of them."""
-    return (a * b[..., [1, 2, 0]] - a[..., [1, 2, 0]] * b)[..., [1, 2, 0]]
+    after = np.array([1, 2, 0])
+    return (a * b.take(after, -1, mode="wrap") - a.take(after, -1, mode="wrap") * b).take(after, -1, mode="wrap")
 
 
 def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:

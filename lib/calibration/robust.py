@@ -167,8 +167,7 @@ def _sampled(H: np.ndarray, u: np.ndarray, count: int, rng: np.random.Generator,
     thick = volume / np.maximum((corners**2).sum(axis=(1, 2)), 1e-300)  # at least
     thin = thick <= max(least, least_mm)
     thick[thin] = np.sqrt(np.maximum(np.linalg.eigvalsh(corners[thin].mT @ corners[thin])[:, 0], 0.0))
-    spans = thick > least
-    if not spans.any():
+    if not (spans := thick > least).any():
         raise DataError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
     sets, thick = sets[spans], thick[spans]
     fine = thick > least_mm

@@ -52,8 +52,7 @@ class Shape:
         freedom, share = tried[:, None], (tried[:, None] + 2.0) / (2.0 * len(r2))
         s2 = np.full(freedom.shape, before.scale if before else max(np.sqrt(np.median(r2)), _LEAST_PX)) ** 2
         for _ in range(4):
-            most = freedom * s2 + r2
-            s2 = np.maximum(share * s2 * np.divide(r2, most, out=most).sum(axis=1, keepdims=True), _LEAST_PX**2)
+            s2 = np.maximum(share * s2 * (r2 / (freedom * s2 + r2)).sum(axis=1, keepdims=True), _LEAST_PX**2)
         likelihood = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1)
         best = likelihood.argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(freedom[best, 0])), float(likelihood[best])
