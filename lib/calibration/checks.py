@@ -49,7 +49,7 @@ def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
 
 def extents(x: np.ndarray) -> np.ndarray:
     """(3,) RMS extents of points (n, 3) along their principal axes, the largest first; the last is their thickness."""
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
+    return np.sqrt(np.maximum(np.linalg.eigvalsh((c := x - x.mean(axis=0)).T @ c / len(x))[::-1], 0.0))
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:

@@ -46,9 +46,8 @@ class Unsettled(RuntimeWarning):
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
-    With `offset_mm` (..., 3, 3), the axes (..., n, 3, 3) of the landmarks moved by it in these same axes; of fewer landmarks,
-    the others stay.  Tips that are reported crossed leave two; those that turn least from row to row count, so the rows must
-    be in order of time.
+    With `offset_mm` (..., 1 to 3, 3), the axes (..., n, 3, 3) of the landmarks moved by it in these same axes.  Tips that are
+    reported crossed leave two; those that turn least from row to row count, so the rows must be in order of time.
     NaN where the tips are reported closer than 5 % of the tool's length, or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
@@ -301,9 +300,10 @@ def start_of_turning(
         cost = len(r) * np.log(median) + 2 * np.log1p(r2 / median).sum()
         return float(cost), offset + step.reshape(offset.shape)
 
-    grid = np.tensordot(list(product(_GRID_MM, repeat=3)), along, 1)
-    grid = np.stack([from_here(*one)[1] for one in zip(grid, of_rows(grid), strict=True)])
-    starts = [(from_here(*one)[0], one[0]) for one in zip(grid, of_rows(grid), strict=True)]
+    starts = []
+    for few in np.split(np.tensordot(list(product(_GRID_MM, repeat=3)), along, 1), 9):  # all at once take much memory
+        few = np.stack([from_here(*one)[1] for one in zip(few, of_rows(few), strict=True)])
+        starts += [(from_here(*one)[0], one[0]) for one in zip(few, of_rows(few), strict=True)]
     best = min(starts, key=lambda start: start[0])
     for _, offset in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
         (cost, to), share = from_here(offset), 1.0
