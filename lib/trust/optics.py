@@ -79,8 +79,7 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
         # Pixels cannot tell x from y; and where cameras fit without that cause, their pixels must be implausible, too.
         told = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
         accused, refuted = _jaws(case)
-        for h in accused or (_scaled_axis(A, covariance) if told else ()):
-            yield replace(h, name="odd_pixels", text=_ODD_PIXELS, cure=_STEADY, explained=_UNDECIDED) if refuted(h) else h
+        yield from accused or (_scaled_axis(A, covariance, refuted) if told else ())
     if misfit < 2 * FITS:  # nor do they tell left from right
         yield from _handedness(case, A, covariance, fit.nearness)
 
@@ -98,17 +97,17 @@ def _constraints(A: np.ndarray) -> np.ndarray:
     return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
-def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[Hypothesis], bool]]:
+def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[int, float], bool]]:
     """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
 
     If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
-    Returns what that shows, and whether it refutes another accusation.
+    Returns what that shows, and whether it refutes that an axis, 0 to 2, is so many times too long.
     """
     x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
     jaws = x[:, 1:] - x[:, :1]
     squares = (jaws**2).sum(axis=2, keepdims=True)
     if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
-        return [], lambda other: False
+        return [], lambda axis, scale: False
     opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
     n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
     # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
@@ -123,12 +122,11 @@ def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[Hypothesis], bool]]:
     sums = [part.sum(axis=0) for part in np.array_split(turns * (length[:, None] - slopes * turns), _PARTS)]  # errors last
     sds = np.hypot(np.linalg.norm(sums, axis=0) / along, _OWN_SD)
 
-    def refuted(other: Hypothesis) -> bool:
-        """Of an axis by its pixels: whether the slope that an axis of such a scale makes is not there, though the jaws turn enough to show it."""
-        j = "xyz".index(other.text.split("robot's ")[1][0])
-        q = 1.0 - other.value**-2.0
-        due = -q / (1.0 - q * squared[j])
-        return bool(enough[j] and abs(slopes[j]) < abs(due) / 2 and abs(due - slopes[j]) > _SURE_SCALED * sds[j])
+    def refuted(axis: int, scale: float) -> bool:
+        """Whether the slope that this would make is missing, though the jaws turn enough to show it."""
+        q = 1.0 - scale**-2.0
+        due, slope = -q / (1.0 - q * squared[axis]), slopes[axis]
+        return bool(enough[axis] and abs(slope) < abs(due) / 2 and abs(due - slope) > _SURE_SCALED * sds[axis])
 
     k = (common**2 / along).argmax()
     slope, sd, total = slopes[k], float(sds[k]), length @ length
@@ -144,10 +142,13 @@ def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[Hypothesis], bool]]:
     return found, refuted
 
 
-def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+def _scaled_axis(
+    A: np.ndarray, covariance: np.ndarray, refuted: Callable[[int, float], bool] = lambda axis, scale: False
+) -> Iterator[Hypothesis]:  # fmt: skip
     """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong.
 
-    Images that were resized to another shape make them oblong, too, and do no harm: the cameras take that on.
+    Images that were resized to another shape make them oblong, too, and do no harm: the cameras take that on.  Where it is
+    `refuted` that the axis is to blame, something else is.
     """
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
@@ -162,7 +163,7 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     none, resized = float(misfit[0, 80]), np.inf
     for free in np.array([[0, 0, 1, 1], [0, 0, 1, 0], [0, 0, 0, 1]]):  # the log aspect of both images, or of one
         resized = min(resized, none - float((free @ information @ stated) ** 2 / (free @ information @ free)))
-    for name, values in zip("xyz", misfit, strict=True):
+    for axis, values in enumerate(misfit):
         best = int(values.argmin())
         if not 0 < best < len(values) - 1:  # no scale mends it
             continue
@@ -172,13 +173,18 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
         log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
         scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
+        name = "xyz"[axis]
         text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
         # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
         if resized < least + _RATHER_RESIZED:
             text += " They may as well be oblong because the images were resized, which cameras take on."
             explained = min(explained, _UNDECIDED)
-        yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
+        size = scale, sd * scale, "times"
+        if refuted(axis, scale):
+            yield Hypothesis("odd_pixels", _ODD_PIXELS, _STEADY, *size, min(explained, _UNDECIDED), gain)
+        else:
+            yield Hypothesis("scaled_axis", text, _SCALE.format(name), *size, explained, gain)
 
 
 def stands_exchanged(fit: Robust) -> bool:
@@ -225,7 +231,7 @@ def _handedness(
             cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
             yield Hypothesis("mirrored_axis", text, cure, *size)
         else:
-            text = f"{where}, and the robot's frame is right-handed: the eyes are exchanged, or both are turned by 180 degrees."
+            text = f"{where}, and no axis is mirrored: the eyes are exchanged, or both images are turned by 180 degrees."
             cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
             yield Hypothesis("exchanged_eyes", text, cure, *size)
     elif mirrored:
