@@ -174,7 +174,7 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
         rows = (problem.frame >= first) & (problem.frame < last)
         when = "{:.2f} to {:.2f} s".format(*problem.time[rows][[0, -1]])
         cure = "Look at these frames and at the robot's log of this time, or leave them out (Correspondences.subset)."
-        parts.append(("bad_stretch", rows, 4, f"Frames {first} to {last - 1} of those seen ({when}) have", cure))
+        parts.append(("bad_stretch", rows, 4, f"Frames {problem.number[first]} to {problem.number[last - 1]} ({when}) have", cure))
     for name, rows, extra, what, cure in parts:
         inside, outside = problem.used & rows[:, None], problem.used & ~rows[:, None]
         if not inside.any() or not outside.any():
@@ -196,7 +196,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     late = (problem.frame >= frame)[:, None]
     y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
     exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
-    text = f"From about frame {frame} of those seen on, the left image is the right one."
+    number = problem.number[frame]  # in the recording
+    text = f"From about frame {number} on, the left image is the right one."
     cure = "Exchange the images of these frames between left/ and right/."
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
     yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
@@ -204,7 +205,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
     if fit.total > both.total - _AS_GOOD:
         size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
-        text = f"The tool slipped at about frame {frame} of those seen, by {size:.0f} um ({along} um in the tool's axes)."
+        text = f"The tool slipped at about frame {number}, by {size:.0f} um ({along} um in the tool's axes)."
         cure = "Fix the tool in its holder, or calibrate before and after on their own. "
         cure += "Where the tool does not turn, a robot whose zero changed looks the same."
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
@@ -213,7 +214,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         rows = problem.used[:, views] & late
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
-        text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."
+        text = f"{who} moved or zoomed at about frame {number}: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)
         yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)

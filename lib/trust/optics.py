@@ -194,7 +194,7 @@ def stands_exchanged(fit: Robust) -> bool:
 
 
 def _side(A: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Along the image rows, where the right camera of A (2, 2, 3), of `covariance` (12, 12), stands, rad, and its deviation."""
+    """Where the right camera of A (2, 2, 3), of `covariance` (12, 12), stands along the image rows, rad, and deviation."""
     side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
     J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
     return float(side), float(np.sqrt(J @ covariance @ J))

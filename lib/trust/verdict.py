@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from lib import paths
 from lib.calibration import Calibration, CompetingCamerasError, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.calibration.checks import extents
-from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
+from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose
@@ -43,6 +43,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "roll": (30.0, 90.0),
     # One image is a mirror image (1) or not (0).
     "mirrored": (0.5, np.inf),
+    # Standard deviations of 1/distance below 0; errors that last make it 6.
+    "hollow": (8.0, 10.0),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
     "coverage": (1.5, np.inf),
     # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
@@ -246,6 +248,10 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
+    nearness, sd = c.inverse_distance_per_mm
+    text = "Farther things look larger: both images are mirrored, or a left-handed robot frame goes with exchanged eyes."
+    cure = "Flip both images, or use a right-handed robot frame and exchange left and right."
+    yield "hollow", -nearness / sd if sd > 0 else 0.0, text, cure, "mirrored_images"
 
     text = f"The tool's positions lie {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
     yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
@@ -295,6 +301,8 @@ def assess(
     try:
         fit = calibrate if "model" in options else calibrate_as_shown
         calibration = fit(data, image_size_px=recording.image_size_px, **options)
+    except np.linalg.LinAlgError:
+        error = DataError("the fit runs away; no cameras see these rows so. Check times, axes and units of kinematics.csv.")
     except ValueError as refused:
         error = refused
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):

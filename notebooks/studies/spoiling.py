@@ -393,6 +393,12 @@ def _backlash(size_mm: float) -> Callable[[Scene], None]:
     return _report(lambda scene, t, x: x + 0.5 * size_mm * np.sign(np.gradient(gaussian_filter1d(x, 4, axis=0), axis=0)))
 
 
+def _flange(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The robot reports points 12 mm behind: its tool has no length."""
+    along = x[:, 1:].mean(axis=1) - x[:, 0]
+    return x - 12.0 * (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
+
+
 def _exchanged_later(scene: Scene, u: np.ndarray) -> np.ndarray:
     """From the middle on left is right."""
     u, first = u.copy(), round(scene.rng.uniform(0.3, 0.7) * len(u))
@@ -598,6 +604,7 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("robot has backlash", "0.1 mm"): (("backlash",), _backlash(0.1)),
     ("eyes exchanged later", ""): (("exchanged_eyes",), _pixels(_exchanged_later)),
     ("clock", "3 s"): (("clock",), _set(offset_s=3.0)),
+    ("tool length not set", "12 mm"): (("landmark_offset",), _report(_flange)),
 }  # fmt: skip
 
 #: Good recordings: sizes, rigs, noise levels, detectors.

@@ -67,6 +67,7 @@ def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
         ("left image sways", "4 px, each frame", 4.0 * np.sqrt(2)), ("microscope sways", "6 px, each frame", None),
         ("left lens breathes", "2 %", 1.4), ("robot has backlash", "0.1 mm", None),
         ("frames stamped apart", "20 ms", None), ("eyes exchanged later", "", None),
+        ("tool length not set", "12 mm", 12000.0),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
@@ -345,6 +346,39 @@ def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
 def test_a_clock_that_is_off_by_seconds_is_found_where_log_and_video_still_overlap(offset_s):
     clock = found(take(offset_s=offset_s, frames=60)).best
     assert clock.name == "clock" and clock.value == pytest.approx(-1e3 * offset_s, abs=max(4 * clock.sd, 5))
+
+
+@pytest.mark.parametrize("rate", [2.0, 0.5])
+def test_a_log_of_another_rate_is_found_where_both_clocks_started_together(rate):
+    usual = take(frames=60)
+    log = usual.kinematics
+    other = Kinematics(log.time_s[0] + rate * (log.time_s - log.time_s[0]), log.x_mm)
+    rows = zip(usual.data.time_s, usual.data.landmark, strict=True)
+    x_mm = np.stack([other.at(np.full((1, 3), time))[0, landmark] for time, landmark in rows])
+    best = found(replace(usual, kinematics=other, data=replace(usual.data, x_mm=x_mm))).best
+    assert best.name == "clock_rate" and best.value == pytest.approx(rate, abs=max(4 * best.sd, 0.002 * rate))
+    shift_s = float(re.search(r"Add (-?[\d.]+) to offset_s", best.cure)[1])
+    assert shift_s == pytest.approx((1 - rate) * log.time_s[0], abs=0.02)
+
+
+def test_perspective_tells_a_mirrored_world_whichever_way_the_tool_points():
+    mirrored = found(take("both images mirrored", "and the tips exchanged", inverse_distance_per_mm=1 / 150)).best
+    assert mirrored.name == "mirrored_images" and "farther things look larger" in mirrored.text
+    usual = take(inverse_distance_per_mm=1 / 150)  # where the world is not, a tool may point at the cameras
+    x = usual.data.x_mm.reshape(-1, 3, 3)
+    x = (2 * x.mean(axis=1, keepdims=True) - x).reshape(-1, 3)
+    noise = np.random.default_rng(0).normal(0, 1, (2, len(x), 2))
+    left, right = (pixels + own for pixels, own in zip(usual.rigs[0].project(x), noise, strict=True))
+    data = replace(usual.data, x_mm=x, u_left=left, u_right=right)
+    assert "mirrored_images" not in {h.name for h in diagnose(data, image_size_px=usual.image_size_px).hypotheses}
+
+
+def test_pixels_that_no_axis_explains_accuse_none():
+    """The images are sheared, and the jaws keep their lengths, whichever way they point."""
+    usual, sheared = take(frames=60), np.array([[1.0, 0.0], [0.05, 1.0]])
+    data = replace(usual.data, u_left=usual.data.u_left @ sheared, u_right=usual.data.u_right @ sheared)
+    best = found(replace(usual, data=data)).best
+    assert best.name == "odd_pixels" and best.explained < 0.5
 
 
 def test_a_log_of_another_time_accuses_the_clock_and_no_detector():
