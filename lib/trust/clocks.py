@@ -11,7 +11,7 @@ from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
 
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
-_ROWS = 400  # of the coarse search
+_ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search
 _LONGEST_S = 60.0  # its half width where cameras do not fit
 _WORTH = 20.0  # log likelihood that some other clock or order gains, before another one is tried
 _FAR_OFF = 0.01  # a rate that differs by more must make most of the frames fit
@@ -71,7 +71,7 @@ def _refined(
 def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Trial shifts (t,) and their misfit (t, 2) in each camera alone."""
     problem = case.problem
-    trial = np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, max(60, half_s / 0.05))) + 1)
+    trial = np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, np.clip(half_s / 0.05, 60, _MOST_TRIALS))) + 1)
     chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
     later = (rate - 1.0) * (problem.time - np.median(problem.time))
     y = np.where(problem.used[:, :, None], problem.y, np.nan)[chosen].reshape(-1, 4)
@@ -81,7 +81,7 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     """A wrong frame rate, or frames in reverse; one that is far off is sought only where the residuals are large."""
     rate, shift = 1.0, 0.0
-    if case.misfit(case.null, *case.fits.values()) >= FITS:
+    if case.misfit(case.null) >= FITS:
         # Clocks of other rates may have started together, half the span before its middle.
         scans = {rate: _scan(case, (0.2 + abs(abs(rate) - 1) / 2) * case.paths.span_s, rate) for rate in (1.0, *_RATES)}
         rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())

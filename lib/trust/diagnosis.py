@@ -20,7 +20,7 @@ from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
-from lib.trust.unsteady import FRAME_TESTS, is_constant
+from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, is_constant
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
@@ -384,7 +384,7 @@ def diagnose(
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _tool_length, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, *FRAME_TESTS]
-    found = compared([h for test in tests for h in test(whole if test is _frozen else case)])
+    found = compared([h for test in tests for h in test(whole if test is _frozen else case)], OF_FRAMES)
     if case.misfit(case.null, *(case.fits[name] for name in _OF_TIME if name in case.fits)) >= FITS:
         found += apart
     best = Diagnosis(found := _plainest([h for h in found if np.isfinite(h.gain)])).best

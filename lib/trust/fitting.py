@@ -381,14 +381,20 @@ class Case:
         return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], explained, _gain(*evidence), images, evidence)
 
 
-def compared(found: list[Hypothesis]) -> list[Hypothesis]:
+def compared(found: list[Hypothesis], of_frames: tuple[str, ...] = ()) -> list[Hypothesis]:
     """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs.
 
-    So they do for causes of one or two numbers: what is left may be in stretches, by which its own rows hardly count.
+    So they do for causes of one or two numbers: what is left may be in stretches, by which its own rows hardly count.  Those
+    named in `of_frames`, with numbers for each frame, leave no stretches whatever is wrong; they take the others' design.
     """
-    least, gains = min((h.evidence[3] for h in found if h.is_named), default=np.inf), []
+    designs = [h.evidence[3] for h in found if h.is_named and h.name not in of_frames]
+    least, gains = min(designs, default=np.inf), []
     for h in found:
-        design = min(least, h.evidence[3]) if h.is_named or h.evidence[2] <= 2 else h.evidence[3]
+        design = h.evidence[3]
+        if h.name in of_frames:
+            design = least if designs else design
+        elif h.is_named or h.evidence[2] <= 2:
+            design = min(least, design)
         more = max(_gain(*h.evidence[:3], design), 0.0) - max(_gain(*h.evidence), 0.0)
         gains.append(max(h.gain, 0.0) + more if more else h.gain)
     return [replace(h, gain=gain) for h, gain in zip(found, gains, strict=True)]

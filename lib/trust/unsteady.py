@@ -123,5 +123,7 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
     return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
 
 
+#: Which have numbers for each frame that whiten the residuals of any fault.
+OF_FRAMES = ("robot_noise", "time_stamps", "image_sways", "zoom_varies")
 #: They need nothing but the rows, and the tool's path in time where there is one.
 FRAME_TESTS = (rigid_tips, unsteady_robot, unsteady_images)
