@@ -21,6 +21,7 @@ from lib.recordings.tables import decoded, read_toml
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
+_NUMBERED = re.compile(r"^(.*?)[ _.\[(]*\d[ _.,\[\]()]*\d?[\])]?$")
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
 
 
@@ -47,7 +48,9 @@ def guess_mapping(source: str | Path) -> str:
         table = key in ("video", "robot", "tool", "labels")
         lines = {f"{key}.{inner}": entry for inner, entry in value.items()} if table else {key: value}
         text += f"\n[{key}]\n" if table and value else ""
-        text += "".join(f"{k.split('.')[-1]} = {toml(v)}  # {tells[k]}\n" for k, v in lines.items())
+        open_rotation = key == "robot" and "pose" in robot and "rotation" not in robot["pose"]
+        told_of = tells | ({"robot.pose": tells["robot.rotation"]} if open_rotation else {})
+        text += "".join(f"{k.split('.')[-1]} = {toml(v)}  # {told_of[k]}\n" for k, v in lines.items())
     return text
 
 
@@ -106,7 +109,7 @@ def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
     """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
     time = next(filter(_TIME.search, columns), next(iter(columns)))
     if any(":" in cell for cell in columns[time][:1]):
-        return {"time": time, "time_unit": "iso"}
+        return {"time": time, "time_unit": "hms" if re.match(r"\d\d?:", columns[time][0]) else "iso"}
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}
     step = np.nanmedian(np.diff(_numbers(columns[time][:100], decimal))) if len(columns[time]) > 1 else 0.0
@@ -121,11 +124,10 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     name = max(tables, key=lambda name: tables[name].stat().st_size)
     dialect, columns = _table(tables[name])
     time = _time(columns, dialect["decimal"])
-    fours = ([c[:-1] + axis for axis in axes] for c in columns for axes in ("xyzw", "XYZW") if c[-1:] == axes[3])
-    turn = next((four for four in fours if set(four) <= columns.keys()), [""])
+    turn = _rotation(columns, dialect["decimal"])
     groups: dict[str, dict[str, str]] = {}
     for column in columns:
-        if (match := _AXIS.match(column)) and column not in (*turn, time["time"]):
+        if (match := _AXIS.match(column)) and column not in (*turn.get("rotation", ()), time["time"]):
             groups.setdefault(match[1], {})[match[2].lower()] = column
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
@@ -136,13 +138,30 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
         span = max(float(np.ptp(known)) if len(known := x[np.isfinite(x)]) else 1.0 for x in axes)
         length = "m" if span < 0.3 else "um" if span > 2000 else "mm"
     told = {"file": name, **dialect, **time, "length_unit": length}
-    if len(points) > 1 and not all(turn):
+    if len(points) > 1 and not turn:
         return told | {"landmarks": _matched(points)}
-    pose = {"position": points[min(points, key=lambda prefix: "pos" not in prefix.lower())]}
-    pose |= {"rotation": turn, "rotation_kind": "quaternion_xyzw"}
+    pose = {"position": points[min(points, key=lambda prefix: "pos" not in prefix.lower())], **turn}
     if jaw := next((column for column in columns if re.search(r"(?i)grip|jaw|open", column)), ""):
         pose |= {"gripper": jaw, "gripper_unit": next((unit for unit in ("deg", "mm") if unit in jaw.lower()), "rad")}
     return told | {"pose": pose}
+
+
+def _rotation(columns: dict[str, list[str]], decimal: str) -> dict:
+    """The columns of the tool's rotation and its kind: a quaternion by its names, or numbered columns with such values."""
+    fours = ([c[:-1] + axis for axis in axes] for c in columns for axes in ("xyzw", "XYZW") if c[-1:] == axes[3])
+    if four := next((four for four in fours if set(four) <= columns.keys()), []):
+        return {"rotation": four, "rotation_kind": "quaternion_xyzw"}
+    numbered: dict[str, list[str]] = {}
+    for column in sorted(columns):
+        if match := _NUMBERED.match(column):
+            numbered.setdefault(match[1], []).append(column)
+    for names in numbered.values():
+        if kind := {4: "quaternion_wxyz", 9: "matrix"}.get(len(names), ""):
+            values = np.stack([_numbers(columns[name], decimal) for name in names], axis=-1)
+            rows = values[np.isfinite(values).all(axis=1)].reshape(-1, *((1, 4) if len(names) == 4 else (3, 3)))
+            if len(rows) and np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(rows.shape[1])).max() < 1e-2:
+                return {"rotation": names, "rotation_kind": kind}
+    return {}
 
 
 def _bag(folder: Path, name: str) -> dict:

@@ -46,7 +46,11 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     robot_time, *reported = read_robot(folder, told)
     increasing(robot_time, str(folder / told.robot.file), *_LOG_STEP_S)
     # A recording's times count from 0, or from the first whole second of times that count from a date.
-    zeros = stereo_zero, robot_zero = [Decimal(int(t) if abs(t) > _EPOCH_S else 0) for t in (stereo.time[0], robot_time[0])]
+    # So do times of day, unless both tables have such.
+    of_day = [table is not None and table.time_unit == "hms" for table in (told.video.table, told.robot)]
+    starts = [stereo.time[0], robot_time[0]]
+    dated = [abs(t) > _EPOCH_S or (day and not all(of_day)) for t, day in zip(starts, of_day, strict=True)]
+    zeros = stereo_zero, robot_zero = [Decimal(int(t) if date else 0) for t, date in zip(starts, dated, strict=True)]
     one_dated = bool(stereo_zero) != bool(robot_zero)  # the other starts at 0
     estimated = told.robot.offset_s == "estimate"
     given = Decimal("0" if estimated else str(told.robot.offset_s))
@@ -61,6 +65,10 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         low, high = sorted(robot_time[end] - stereo.time[end] for end in (0, -1))
         cure = f"a number from {low:.3f} to {high:.3f}, so that they overlap (t_robot = t_video + offset_s)"
         cure += ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
+        half_hours = int(high // 1800)  # the most that make them overlap
+        if all(zeros) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
+            hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
+            cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
         cure = f"Set robot.offset_s (now {told.robot.offset_s!r}) in {mapping} to {cure}"
         raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read

@@ -22,14 +22,17 @@ _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
-    """A time as exact seconds; "iso" dates without a zone count as UTC.
+    """A time as exact seconds; "iso" dates without a zone count as UTC, and "hms" times of day from midnight.
 
     >>> exact_seconds("1700000000123456789", "ns", "log.csv"), exact_seconds("1970-01-01T00:00:01.5", "iso", "log.csv")
     (Decimal('1700000000.123456789'), Decimal('1.500000'))
+    >>> exact_seconds("9:29:59.28", "hms", "log.csv")
+    Decimal('34199.280000')
     """
     with suppress(ValueError, InvalidOperation):
-        if unit == "iso":
-            date = datetime.fromisoformat(text.strip())
+        if unit in ("iso", "hms"):
+            day = "" if unit == "iso" else "1970-01-01T0" if text.strip()[1:2] == ":" else "1970-01-01T"
+            date = datetime.fromisoformat(day + text.strip())
             date = date if date.tzinfo else date.replace(tzinfo=UTC)
             return Decimal((date - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1)).scaleb(-6)
         value = Decimal(text.strip()) * _SECONDS[unit]
@@ -57,12 +60,13 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
 
 
 def uncommented(text: str, separator: str = "") -> list[str]:
-    """The lines of a table, those of comments blank.  The last comment before numbers is the header if it has as many cells.
+    """The lines of a table; comments and a row of units below the header are blank.
 
-    `numpy.savetxt` writes headers so.  The separator of its first row is found where none is given.
+    The last comment before numbers is the header if it has as many cells: `numpy.savetxt` writes headers so.  The separator
+    of its first row is found where none is given.
 
-    >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n")
-    ['', 't,x', '0.1,2']
+    >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n"), uncommented("t,x\\ns,mm\\n0.1,2\\n")
+    (['', 't,x', '0.1,2'], ['t,x', '', '0.1,2'])
     """
     lines = text.splitlines()
     bare = ["" if line.lstrip()[:1] in ("#", "%") else line for line in lines]
@@ -72,6 +76,11 @@ def uncommented(text: str, separator: str = "") -> list[str]:
         as_many = header.count(separator) == bare[first].count(separator)
         if as_many and all(re.fullmatch(r"[-+]?\.?\d.*|nan|", cell.strip(' \t"'), re.IGNORECASE) for cell in cells):
             bare[first - 1] = header
+    filled = [i for i, line in enumerate(bare) if line.strip()][:2]
+    if len(filled) == 2:
+        head, below = (bare[i].split(separator or separator_of(bare[filled[0]])) for i in filled)
+        if len(head) == len(below) and not any(re.match(r"[-+.]?\d", cell.strip(' \t"')) for cell in below):
+            bare[filled[1]] = ""
     return bare
 
 

@@ -27,7 +27,7 @@ class Table(_Section):
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Literal[".", ","] = "."
     time: str
-    time_unit: Literal["s", "ms", "us", "ns", "iso"] = "s"
+    time_unit: Literal["s", "ms", "us", "ns", "iso", "hms"] = "s"
 
 
 class Video(_Section):

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lib import paths
 from lib.calibration import calibrate
@@ -16,7 +17,7 @@ from lib.calibration.offsets import tool_axes
 from lib.correspondences import LANDMARKS, of_recording
 from lib.geometry import RigidTransform
 from lib.importing import guess_mapping, import_recording, importer, logs, read_mapping
-from lib.recordings import Annotations, Recording
+from lib.recordings import Annotations, Kinematics, Recording
 from lib.recordings.frames import Frames
 from tests.importing import foreign
 
@@ -233,6 +234,59 @@ def test_a_quaternion_of_any_name_is_no_point(shipped, tmp_path):
         log.write_text(log.read_text().replace(f"q{axis}", f"pose.ori_{axis}", 1))
     pose = tomllib.loads(guess_mapping(folder))["robot"]["pose"]
     assert pose["rotation"] == [f"pose.ori_{axis}" for axis in "xyzw"] and pose["position"] == ["px", "py", "pz"]
+
+
+@pytest.mark.parametrize(("ends", "kind"), [
+    (["q0", "q1", "q2", "q3"], "quaternion_wxyz"),
+    ([f"rot[{i}][{j}]" for i in range(3) for j in range(3)], "matrix"),
+    ([f"r{i}{j}" for i in "123" for j in "123"], "matrix"),
+    (["j1", "j2", "j3", "j4"], ""),
+])  # fmt: skip
+def test_numbered_columns_are_a_rotation_where_their_values_are(ends, kind, shipped, tmp_path):
+    """What the guess cannot know it leaves out, and says what to write."""
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side)
+    turns = Rotation.from_matrix(np.array([pose.R for pose in foreign.posed(few)[0]]))
+    values = turns.as_matrix().reshape(-1, 9) if kind == "matrix" else turns.as_quat(scalar_first=True)
+    table = np.column_stack([few.robot_s, few.x_mm[:, 0], values if kind else values + 0.1])
+    header = ",".join(["t", "px", "py", "pz", *ends])
+    np.savetxt(folder / "log.csv", table, "%.7f", ",", header=header, comments="")
+    text = guess_mapping(folder)
+    pose = tomllib.loads(text)["robot"]["pose"]
+    if not kind:
+        assert "rotation" not in pose and "no rotation was found: add rotation = [its columns], rotation_kind" in text
+        return
+    assert (pose["rotation"], pose["rotation_kind"]) == (ends, kind)
+    path.write_text(text.replace("jaw_mm = [0.0", "jaw_mm = [3.0"), "utf-8")
+    np.testing.assert_allclose(logs.read_robot(folder, read_mapping(path))[2], turns.as_matrix(), atol=1e-5)
+
+
+def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
+    few = replace(thinned(shipped, 5), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    cells = [row.partition(",") for row in rows]
+    rows = [f"9:{30 + int(float(t) // 60):02d}:{float(t) % 60:09.6f},{rest}" for t, _, rest in cells]
+    (folder / "log.csv").write_text("\n".join([header, "hh:mm:ss" + ",mm" * 9, *rows]))
+    text = guess_mapping(folder)
+    path.write_text(text, "utf-8")
+    told = read_mapping(path)
+    assert (told.robot.time_unit, told.robot.length_unit) == ("hms", "mm")
+    path.write_text(text.replace('offset_s = "estimate"', "offset_s = 34200"), "utf-8")
+    did = import_recording(folder, path, tmp_path / "eye")["did"]
+    recording = Recording.open(tmp_path / "eye")
+    np.testing.assert_allclose(recording.landmarks_mm(), Kinematics(few.robot_s, few.x_mm).at(few.time_s), atol=1e-5)
+    assert "Times of the robot count from 34199 s." in did and recording.offset_s == 1
+
+
+def test_a_local_time_zone_is_named(shipped, tmp_path):
+    """Frames in Unix time, a log of dates without a zone."""
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6] + 1_700_000_000)
+    late = replace(few, robot_s=few.robot_s - few.robot_s[0] + 1_700_000_000 + 5400)
+    folder, mapping = source_of(tmp_path, late, foreign.images, foreign.robot_csv)
+    cure = r"so that they overlap.* Is a time zone of \+1\.5 hours between them\? Then offset_s = 5400\.$"
+    with pytest.raises(ValueError, match=cure):
+        import_recording(folder, mapping, tmp_path / "eye")
 
 
 def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped, tmp_path):
