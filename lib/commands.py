@@ -126,7 +126,7 @@ def main_reconstruct(argv: list[str]) -> int:
 def main_register(argv: list[str]) -> int:
     """`python3 -m lib register`: where cameras that were calibrated before are now, after the microscope was moved."""
     a, recording, out = _parsed("register", main_register, argv)
-    data, offsets = _data(a, recording), _offsets_beside(a.rig)
+    data, (*_, offsets) = _data(a, recording), _beside(a.rig)
     seen = with_offsets(data, offsets)
     found = register_images(StereoRig.load(a.rig), seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
     moved, seen = StereoRig.load(a.rig).moved(found.transform), seen.complete
@@ -152,20 +152,22 @@ def _told(offsets: LandmarkOffsets | None) -> dict:
     return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
-def _offsets_beside(rig: Path) -> LandmarkOffsets | None:
-    """Offsets of the landmarks from the robot's report that belong to a rig, by the results beside its file."""
+def _beside(rig: Path) -> tuple[str, Verdict, LandmarkOffsets | None]:
+    """The recording that a rig is of, its verdict and the landmarks' offsets from the report, by the results beside it."""
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
     if not path.is_file():
-        return None
+        return "", Verdict(), None
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
         offset, turns = told["landmark_offsets_mm"], bool(told["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
+        own = rig.name in ("rig.json", "moved_rig.json") and "recording" in told  # a refined rig is another
+        folder, verdict = told["recording"] if own else "", Verdict(tuple(Reason(**r) for r in told["reasons"] if own))
     except (ValueError, KeyError, TypeError) as error:
         what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
         raise ValueError(f"{what}; calibrate again, or move that file away.") from None
     unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
-    return None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
+    return folder, verdict, None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
 
 
 def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:
@@ -202,8 +204,8 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     a = parser.parse_args(argv)
     if a.weights and a.landmarks == "annotations":
         parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
-    if name == "reconstruct" and a.rig and (a.model or a.force):
-        parser.error("--model, --force: with --rig no camera is calibrated; leave them out, or --rig.")
+    if name == "reconstruct" and a.rig and a.model:
+        parser.error("--model: with --rig no camera is calibrated; leave it out, or --rig.")
     a.options = {"model": a.model} if a.model else {}
     Model.parse(a.model or "zero_skew", 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
@@ -238,23 +240,29 @@ def _calibrated(
     given = getattr(a, "rig", None)  # then only the frame's own landmarks are needed, to mask the tool
     data = _data(a, recording, np.array([a.frame % len(recording)]) if given else None)
     if given:
-        text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
-        cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
-        return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    found = assess(recording, data, detector=a.detector, **a.options)
-    if found.calibration is not None and (a.force or not found.verdict.is_red):
+        rig, (folder, verdict, _) = StereoRig.load(given), _beside(given)
+        if folder != str(recording.folder.resolve()):
+            text = f"{given} was not calibrated or registered with this recording, and nothing here tests it."
+            register = shlex.join(["python3", "-m", "lib", "register", str(a.recording), "--rig", str(given)])
+            cure = f"Run: {register}; then give the moved_rig.json that it writes as --rig."
+            verdict = Verdict((Reason("rig_given", LEVELS[1], text, cure),))
+    else:
+        found = assess(recording, data, detector=a.detector, **a.options)
+        rig, verdict = found.calibration, found.verdict
+    if rig is not None and (a.force or not verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
-        return found.calibration, found.verdict, data
-    files.write_json(out / "verdict.json", found.verdict.to_json())
-    force = "" if found.calibration is None else "; --force writes the results of a calibration whatever the verdict"
+        return rig, verdict, data
+    files.write_json(out / "verdict.json", verdict.to_json())
+    force = "" if rig is None else "; --force writes the results of a calibration whatever the verdict"
     earlier = a.earlier.keys() - {out / "verdict.json", out / paths.RECORDING_NOTE}
     earlier = f" Results of an earlier run are in {paths.shown(out)}." if earlier else ""
-    print(f"{found.verdict}\nNothing else was written{force}.{earlier}")
-    return None, found.verdict, data
+    print(f"{verdict}\nNothing else was written{force}.{earlier}")
+    return None, verdict, data
 
 
 def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
-    files.write_json(out / f"{name}.json", numbers | verdict.to_json())
+    numbers |= {"recording": str(a.recording.resolve())} | verdict.to_json()
+    files.write_json(out / f"{name}.json", numbers)
     written = sorted(path.name for path in out.iterdir() if path.lstat().st_mtime_ns != a.earlier.get(path))
     print(f"Wrote {paths.shown(out)}: {', '.join(written)}\n{verdict}")
     return 0

@@ -110,11 +110,38 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
     assert commands.main_reconstruct([*argv, "--rig", str(out / "rig.json")]) == 0
     told = json.loads((tmp_path / "reconstruction.json").read_text())
-    assert told["frame"] == 2 and told["points"] > 500 and told["verdict"] == "doubtful"  # a rig that nothing here tests
+    assert told["frame"] == 2 and told["points"] > 500
+    calibrated = json.loads((out / "calibration.json").read_text())  # from this recording: its verdict holds
+    assert (told["verdict"], told["reasons"]) == (calibrated["verdict"], calibrated["reasons"])
     left, right = (cv2.imread(str(tmp_path / f"rectified_{side}.png")) for side in ("left", "right"))
     matrices = json.loads((tmp_path / "rectification.json").read_text())
     assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
     assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, capsys):
+    """Also one that `register` moved; of another recording, or by another name, nothing tests it."""
+    recording, results = Recording.open(paths.SHIPPED_RECORDING), tmp_path / "results"
+    results.mkdir()
+    told = json.loads((out / "calibration.json").read_text())
+    (results / "calibration.json").write_text(json.dumps(told | {"recording": str(tmp_path / "another")}))
+    red = {"name": "aspect", "level": "not trustworthy", "text": "Oblong.", "cure": "Mend it."}
+    (results / "registration.json").write_text(json.dumps(told | {"reasons": [red]}))
+    for name in ("rig.json", "moved_rig.json", "refined_rig.json"):
+        shutil.copy(out / "rig.json", results / name)
+
+    def verdict(rig, force=False):
+        a = SimpleNamespace(rig=rig, recording=recording.folder, frame=0, landmarks="annotations", force=force, earlier={})
+        found, told, _ = commands._calibrated(a, recording, tmp_path)
+        return found is not None, told.level, [reason.name for reason in told.reasons]
+
+    assert verdict(out / "rig.json") == (True, told["verdict"], [reason["name"] for reason in told["reasons"]])
+    for name in ("rig.json", "refined_rig.json"):
+        assert verdict(results / name) == (True, "doubtful", ["rig_given"])
+    assert verdict(results / "moved_rig.json") == (False, "not trustworthy", ["aspect"])
+    assert (tmp_path / "verdict.json").exists() and "--force writes the results" in capsys.readouterr().out
+    assert verdict(results / "moved_rig.json", force=True) == (True, "not trustworthy", ["aspect"])
+    assert not (tmp_path / "verdict.json").exists()
 
 
 def test_reconstruct_without_open3d_writes_the_rest(out, tmp_path, monkeypatch, capsys):
@@ -169,8 +196,7 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
 
 
 @pytest.mark.parametrize(("command", "argv", "said"), [
-    ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model, --force: with --rig no camera is calibrated"),
-    ("reconstruct", ["--rig", "rig.json", "--force"], "--model, --force: with --rig no camera is calibrated"),
+    ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model: with --rig no camera is calibrated"),
     ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector looks"),
     ("detect", ["--force"], "unrecognized arguments: --force"),
     ("register", ["--rig", "rig.json", "--force"], "unrecognized arguments: --force"),
