@@ -113,6 +113,8 @@ def adapt(
         return work.adapted()
     except RefusalError as refused:
         work.report |= {"improved": False, "reason": str(refused)}
+        if said := recording.mistimed:  # so what else was noticed may be no fact
+            work.report |= {"reason": f"{said} If that is meant: {refused}", "notes": []}
         return Adaptation(work.detector, None, work.finished(), False, {})
 
 

@@ -186,18 +186,24 @@ class Recording:
         k = int(jump_mm.argmax())
         longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
+            (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
+             "Is time_s in seconds? Log ten samples a second or more."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
             (reported / n < _COVERED, "little_overlap",
              f"The robot reports a position in {reported} of {n} frames; {covered} lie between its first and last sample.",
-             "Check offset_s and the time_s columns; export the log of the whole video, without gaps."),
-            (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
-             "Is time_s in seconds? Log ten samples a second or more."),
+             "Check offset_s, fps and the time_s columns; export the log of the whole video, without gaps."),
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
         )  # fmt: skip
         return [Doubt(*told) for holds, *told in cases if holds]
+
+    @property
+    def mistimed(self) -> str:
+        """Doubts of units and gaps of time, with their cures, or "": where no calibration is found, this comes first."""
+        of_time = [doubt for doubt in self.doubts if doubt.name in ("slow_log", "frame_times", "little_overlap")]
+        return " ".join(f"{doubt.text} {doubt.cure}" for doubt in of_time)
 
     @cached_property
     def ground(self) -> Ground:

@@ -118,6 +118,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     next_step = f"{_USE} -p recording RECORDING`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
+        next_step = found.mistimed if a.calibration is None and found.mistimed else next_step
     return Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
 
 

@@ -425,6 +425,16 @@ def test_below_a_tenth_it_says_how_many_to_label(world, recording, tmp_path):
     assert "let the robot teach it" not in reason and len(reason) < 400
 
 
+def test_a_log_in_milliseconds_is_called_so(recording, world, tmp_path):
+    """Nor is anything noted that follows from it."""
+    log = recording.kinematics
+    wrong = replace(recording, kinematics=replace(log, time_s=1000 * log.time_s))
+    found = adapt(wrong, StandIn(world.u, noise_px=0.2), folder=tmp_path, progress=False, tune=pupil(world))
+    reason = found.report["reason"]
+    assert not found.improved and reason.startswith("The robot's log has a sample every 20 s. Is time_s in seconds?")
+    assert "If that is meant: " in reason and found.report["notes"] == []
+
+
 def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "ROUNDS", 3)  # five pairs do not tell the clock, the first round's detector does
     u = np.full(world.u.shape, np.nan)

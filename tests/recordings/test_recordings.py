@@ -672,6 +672,7 @@ def test_doubts(frames, times, jump, name):
     at = Frames(None, None, np.arange(frames) / 25)
     recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
     assert [doubt.name for doubt in recording.doubts] == ([name] if name else [])
+    assert bool(recording.mistimed) == (name not in (None, "jump"))
 
 
 def test_nothing_is_interpolated_in_a_gap():

@@ -69,6 +69,15 @@ def test_nothing_found_is_said_once_and_the_command_ends_well(folder, tmp_path, 
     assert f"lib adapt {folder}" in content["next_step"] or content["next_step"] in said
 
 
+def test_where_nothing_is_calibrated_times_that_are_wrong_come_first(folder, detector):
+    """All frames but one lie beyond the log's end."""
+    recording = Recording.open(folder, truth=False)
+    late = replace(recording, offset_s=recording.kinematics.time_s[-1] - recording.frames.time_s[0] - 0.01)
+    found = check(late, detector=detector)
+    assert found.assessment.calibration is None
+    assert found.next_step.startswith("The robot reports a position in 1 of 10 frames") and "adapt" not in found.next_step
+
+
 def test_the_next_step_names_the_weights_that_were_given(folder, detector, tmp_path, monkeypatch, capsys):
     good = replace(check(folder, detector=detector), next_step=f"Use it: `python3 -m lib run -p recording {folder}`.")
     monkeypatch.setattr(module.Detector, "load", lambda path: detector)
