@@ -133,6 +133,10 @@ def main_register(argv: list[str]) -> int:
     epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
     medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
+    anew = assess(recording, data, detector=a.detector, **a.options)
+    verdict = Verdict.join([_as_one(moved, anew, offsets), anew.verdict])
+    if _refused(a, out, verdict):
+        return 3
     _write_rig(out, moved, recording, "moved_")
     numbers = {"rotation": found.transform.R.tolist(), "translation_mm": found.transform.t.tolist()}
     numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
@@ -141,8 +145,6 @@ def main_register(argv: list[str]) -> int:
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where it is expected (median).")
-    found = assess(recording, data, detector=a.detector, **a.options)
-    verdict = Verdict.join([_as_one(moved, found, offsets), found.verdict])
     return _done(a, out, "registration", numbers | _told(offsets), verdict)
 
 
@@ -194,7 +196,7 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
     add("--model", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ... (default: as the data show)")
-    if name in ("calibrate", "reconstruct"):  # they may be refused
+    if name != "detect":  # they may be refused
         add("--force", action="store_true", help="write results whatever the verdict")
     if name == "reconstruct":
         add("--frame", type=int, default=0, help="number of the frame, from 0")
@@ -249,15 +251,20 @@ def _calibrated(
     else:
         found = assess(recording, data, detector=a.detector, **a.options)
         rig, verdict = found.calibration, found.verdict
-    if rig is not None and (a.force or not verdict.is_red):
+    return None if _refused(a, out, verdict, rig is not None) else rig, verdict, data
+
+
+def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = True) -> bool:
+    """Whether no cameras were `found`, or the verdict forbids results; then that is said, and verdict.json alone is written."""
+    if found and (a.force or not verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
-        return rig, verdict, data
+        return False
     files.write_json(out / "verdict.json", verdict.to_json())
-    force = "" if rig is None else "; --force writes the results of a calibration whatever the verdict"
+    force = "; --force writes the results whatever the verdict" if found else ""
     earlier = a.earlier.keys() - {out / "verdict.json", out / paths.RECORDING_NOTE}
     earlier = f" Results of an earlier run are in {paths.shown(out)}." if earlier else ""
     print(f"{verdict}\nNothing else was written{force}.{earlier}")
-    return None, verdict, data
+    return True
 
 
 def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:

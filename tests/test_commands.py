@@ -92,6 +92,20 @@ def test_register_knows_the_offsets_that_the_calibration_removed(tmp_path, monke
     assert moved_mm < 0.03 and "no_common_motion" not in (tmp_path / "registration.json").read_text()
 
 
+def test_register_writes_no_cameras_under_a_red_verdict(out, tmp_path, capsys):
+    """A rig of another zoom; what an earlier run left there stays."""
+    rig, argv = StereoRig.load(out / "rig.json"), [str(paths.SHIPPED_RECORDING), *LABELS, "--out", str(tmp_path)]
+    StereoRig(*(replace(camera, matrix=1.5 * camera.matrix) for camera in (rig.left, rig.right))).save(tmp_path / "rig.json")
+    argv += ["--rig", str(tmp_path / "rig.json")]
+    assert commands.main_register(argv) == 3
+    assert {path.name for path in tmp_path.iterdir()} == {"rig.json", "verdict.json"}
+    said = capsys.readouterr().out
+    assert "no_common_motion" in said and "--force writes the results" in said and "moved by" not in said
+    assert commands.main_register([*argv, "--force"]) == 0
+    assert {"moved_rig.json", "registration.json"} <= {path.name for path in tmp_path.iterdir()}
+    assert not (tmp_path / "verdict.json").exists() and "moved by" in capsys.readouterr().out
+
+
 def test_register_says_where_no_motion_explains_the_landmarks(out):
     """A rig of another zoom, or of another microscope."""
     rig = StereoRig.load(out / "rig.json")
@@ -199,7 +213,7 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
     ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model: with --rig no camera is calibrated"),
     ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector looks"),
     ("detect", ["--force"], "unrecognized arguments: --force"),
-    ("register", ["--rig", "rig.json", "--force"], "unrecognized arguments: --force"),
+    ("register", ["--rig", "rig.json", "--frame", "2"], "unrecognized arguments: --frame"),
     ("import", ["--guess", "--map", "map.toml", "--overwrite"], "--guess writes a mapping only"),
 ])  # fmt: skip
 def test_an_option_that_cannot_act_is_refused(command, argv, said, tmp_path, capsys):
