@@ -80,7 +80,7 @@ def main_detect(argv: list[str]) -> int:
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(assess(recording, data, detector=a.detector, **a.options).verdict)
+    print(_assessed(a, recording, data).verdict)
     return 0
 
 
@@ -105,7 +105,7 @@ def main_reconstruct(argv: list[str]) -> int:
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
-    frame, now = recording.frames[a.frame], data.of_frames(a.frame % len(recording))
+    frame, now = recording.frames[a.frame], data.of_frames(a.frame)
     tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
@@ -119,7 +119,7 @@ def main_reconstruct(argv: list[str]) -> int:
         save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
     _write_rectified(out, found.rig, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # as the matches refined it
-    numbers = {"frame": a.frame % len(recording), "points": len(found.u), "matches": found.n_matches}
+    numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
 
 
@@ -133,7 +133,7 @@ def main_register(argv: list[str]) -> int:
     epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
     medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
-    anew = assess(recording, data, detector=a.detector, **a.options)
+    anew = _assessed(a, recording, data)
     verdict = Verdict.join([_as_one(moved, anew, offsets), anew.verdict])
     if _refused(a, out, verdict):
         return 3
@@ -148,14 +148,18 @@ def main_register(argv: list[str]) -> int:
     return _done(a, out, "registration", numbers | _told(offsets), verdict)
 
 
+def _assessed(a: argparse.Namespace, recording: Recording, data: Correspondences) -> Assessment:
+    return assess(recording.showing(a.frames), data, detector=a.detector, **a.options)
+
+
 def _told(offsets: LandmarkOffsets | None) -> dict:
     """Offsets of the landmarks as result files hold them."""
     numbers = {"landmark_offsets_mm": offsets and offsets.offset.tolist()}
     return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
-def _beside(rig: Path) -> tuple[str, Verdict, LandmarkOffsets | None]:
-    """The recording that a rig is of, its verdict and the landmarks' offsets from the report, by the results beside it."""
+def _beside(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOffsets | None]:
+    """By the results beside a rig: the recording that it is of (and this frame), its verdict, the landmarks' offsets."""
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
     if not path.is_file():
         return "", Verdict(), None
@@ -164,6 +168,7 @@ def _beside(rig: Path) -> tuple[str, Verdict, LandmarkOffsets | None]:
         offset, turns = told["landmark_offsets_mm"], bool(told["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
         own = rig.name in ("rig.json", "moved_rig.json") and "recording" in told  # a refined rig is another
+        own = own and frame in range(*told["frames"])
         folder, verdict = told["recording"] if own else "", Verdict(tuple(Reason(**r) for r in told["reasons"] if own))
     except (ValueError, KeyError, TypeError) as error:
         what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
@@ -195,26 +200,31 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
+    add("--frames", metavar="A:B", help="of the frames from A to before B alone, as Python's slices (default: of all)")
     add("--model", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ... (default: as the data show)")
     if name != "detect":  # they may be refused
         add("--force", action="store_true", help="write results whatever the verdict")
     if name == "reconstruct":
-        add("--frame", type=int, default=0, help="number of the frame, from 0")
+        add("--frame", type=int, help="number of the frame, from 0 (default: the first)")
         add("--setting", choices=("quality", "fast"), default="quality")
     if name in ("reconstruct", "register"):
         add("--rig", type=Path, required=name == "register", help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
     if a.weights and a.landmarks == "annotations":
         parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
-    if name == "reconstruct" and a.rig and a.model:
-        parser.error("--model: with --rig no camera is calibrated; leave it out, or --rig.")
+    if name == "reconstruct" and a.rig and (a.model or a.frames):
+        parser.error("--model, --frames: with --rig no camera is calibrated; leave them out, or --rig.")
     a.options = {"model": a.model} if a.model else {}
     Model.parse(a.model or "zero_skew", 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
-    if name == "reconstruct" and not -len(recording) <= a.frame < len(recording):
-        parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
+    some, a.frames = a.frames, recording.frames_of(a.frames or ":")
+    if name == "reconstruct":
+        a.frame = a.frames[0] if a.frame is None else a.frame + len(recording) * (a.frame < 0)
+        if a.frame not in a.frames:
+            parser.error(f"--frame: choose one of frames {a.frames[0]} to {a.frames[-1]}.")
     a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
-    out = a.out or paths.results_folder(a.recording.resolve().name, a.recording)
+    part = f"-{a.frames.start}-{a.frames.stop}" if some else ""  # each part has results of its own
+    out = a.out or paths.results_folder(a.recording.resolve().name + part, a.recording)
     out.mkdir(parents=True, exist_ok=True)
     a.earlier = {path: path.lstat().st_mtime_ns for path in out.iterdir()}
     return a, recording, out
@@ -227,8 +237,9 @@ def _labelled(recording: Recording) -> Correspondences:
 
 
 def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None = None) -> Correspondences:
+    frames = np.array(a.frames) if frames is None else frames
     if a.landmarks == "annotations":
-        return _labelled(recording)
+        return _labelled(recording).of_frames(frames)
     if recording.skeleton != LANDMARKS:
         told = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
         raise ValueError(f"{recording.folder}: {told}. Label frames and give --landmarks annotations.")
@@ -240,22 +251,23 @@ def _calibrated(
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
     """The calibration of a recording, None where it is refused, or the rig that --rig names; the verdict; the landmarks."""
     given = getattr(a, "rig", None)  # then only the frame's own landmarks are needed, to mask the tool
-    data = _data(a, recording, np.array([a.frame % len(recording)]) if given else None)
+    data = _data(a, recording, np.array([a.frame]) if given else None)
     if given:
-        rig, (folder, verdict, _) = StereoRig.load(given), _beside(given)
+        rig, (folder, verdict, _) = StereoRig.load(given), _beside(given, a.frame)
         if folder != str(recording.folder.resolve()):
-            text = f"{given} was not calibrated or registered with this recording, and nothing here tests it."
+            text = f"{given} was not calibrated or registered with this recording, or with other frames of it, and nothing "
+            text += "here tests it."
             register = shlex.join(["python3", "-m", "lib", "register", str(a.recording), "--rig", str(given)])
             cure = f"Run: {register}; then give the moved_rig.json that it writes as --rig."
             verdict = Verdict((Reason("rig_given", LEVELS[1], text, cure),))
     else:
-        found = assess(recording, data, detector=a.detector, **a.options)
+        found = _assessed(a, recording, data)
         rig, verdict = found.calibration, found.verdict
     return None if _refused(a, out, verdict, rig is not None) else rig, verdict, data
 
 
 def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = True) -> bool:
-    """Whether no cameras were `found`, or the verdict forbids results; then that is said, and verdict.json alone is written."""
+    """Whether no cameras were `found`, or the verdict forbids results; then that is said, and only verdict.json written."""
     if found and (a.force or not verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
         return False
@@ -268,7 +280,7 @@ def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = T
 
 
 def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
-    numbers |= {"recording": str(a.recording.resolve())} | verdict.to_json()
+    numbers |= {"recording": str(a.recording.resolve()), "frames": [a.frames.start, a.frames.stop]} | verdict.to_json()
     files.write_json(out / f"{name}.json", numbers)
     written = sorted(path.name for path in out.iterdir() if path.lstat().st_mtime_ns != a.earlier.get(path))
     print(f"Wrote {paths.shown(out)}: {', '.join(written)}\n{verdict}")

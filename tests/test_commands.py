@@ -63,6 +63,23 @@ def test_camera_files_of_an_earlier_run_do_not_pass_for_this_ones(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["left.yml", "rig.json", "right.yml"]
 
 
+def test_frames_calibrate_a_part_on_its_own(out, tmp_path, monkeypatch, capsys):
+    """What lies outside is not looked at; its cameras are no others' frames'."""
+    monkeypatch.setattr(paths, "RUNS", tmp_path)
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS]
+    assert commands.main_calibrate([*argv, "--frames", ":17"]) == 0
+    results = tmp_path / f"{paths.SHIPPED_RECORDING.name}-0-17"
+    rows = (results / "landmarks.csv").read_text().splitlines()[1:]
+    assert {int(row.split(",")[0]) for row in rows} == set(range(17))
+    assert json.loads((results / "calibration.json").read_text())["frames"] == [0, 17]
+    assert np.abs(StereoRig.load(results / "rig.json").left.matrix - StereoRig.load(out / "rig.json").left.matrix).max() > 0
+    folder = str(paths.SHIPPED_RECORDING.resolve())
+    assert [commands._beside(results / "rig.json", frame)[0] for frame in (0, 16, 17)] == [folder, folder, ""]
+    with pytest.raises(SystemExit):
+        commands.main_reconstruct([*argv, "--frames", "5:9", "--frame", "9"])
+    assert "--frame: choose one of frames 5 to 8." in capsys.readouterr().err
+
+
 def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):
     """What an earlier run left there is not said to be written now."""
     (tmp_path / "rig.json").write_text("{}")
@@ -210,10 +227,11 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
 
 
 @pytest.mark.parametrize(("command", "argv", "said"), [
-    ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model: with --rig no camera is calibrated"),
+    ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model, --frames: with --rig no camera is calibrated"),
+    ("reconstruct", ["--rig", "rig.json", "--frames", "0:9"], "--model, --frames: with --rig no camera is calibrated"),
     ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector looks"),
     ("detect", ["--force"], "unrecognized arguments: --force"),
-    ("register", ["--rig", "rig.json", "--frame", "2"], "unrecognized arguments: --frame"),
+    ("register", ["--rig", "rig.json", "--setting", "fast"], "unrecognized arguments: --setting"),
     ("import", ["--guess", "--map", "map.toml", "--overwrite"], "--guess writes a mapping only"),
 ])  # fmt: skip
 def test_an_option_that_cannot_act_is_refused(command, argv, said, tmp_path, capsys):

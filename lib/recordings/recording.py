@@ -8,8 +8,8 @@ import re
 import shlex
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -204,6 +204,30 @@ class Recording:
         """Doubts of units and gaps of time, with their cures, or "": where no calibration is found, this comes first."""
         of_time = [doubt for doubt in self.doubts if doubt.name in ("slow_log", "frame_times", "little_overlap")]
         return " ".join(f"{doubt.text} {doubt.cure}" for doubt in of_time)
+
+    def frames_of(self, text: str) -> range:
+        """The frames that --frames names by "A:B", from A to before B as Python's slices; a ValueError if it names none."""
+        ends = re.fullmatch(r"(-?\d+)?:(-?\d+)?", text)
+        frames = range(len(self))[slice(*(int(end) if end else None for end in ends.groups()))] if ends else range(0)
+        if not frames:
+            what = f"it names none of frames 0 to {len(self) - 1}"
+            raise ValueError(f"--frames {text}: {what}; give A:B, from A to before B, such as 0:{max(len(self) // 2, 1)}.")
+        return frames
+
+    def showing(self, frames: range) -> Self:
+        """The recording with the nearest picture of `frames` in place of each other one; numbers, times and ground stay.
+
+        So whoever looks at some pictures does not see where cameras stood before or after.
+        """
+
+        def side(name: str) -> Callable[[int], np.ndarray]:
+            return lambda number: getattr(self.frames[min(max(number, frames[0]), frames[-1])], name)
+
+        if len(frames) == len(self):
+            return self
+        part = replace(self, frames=Frames(side("left"), side("right"), self.frames.time_s))
+        part.__dict__["ground"] = self.ground  # that of the detections
+        return part
 
     @cached_property
     def ground(self) -> Ground:

@@ -99,23 +99,28 @@ class Check:
         return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
-def check(recording: str | Path | Recording, *, detector: Callable | None = None) -> Check:
-    """Detect (by the detector that ships, if none is given), calibrate, diagnose and judge a recording.
+def check(
+    recording: str | Path | Recording, *, detector: Callable | None = None, frames: range | None = None
+) -> Check:  # fmt: skip
+    """Detect (by the detector that ships, if none is given), calibrate, diagnose and judge a recording or its `frames`.
 
     The truth of a recording given by its folder is never opened.  A FileNotFoundError or ValueError if it cannot be read.
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
+    chosen = range(len(found)) if frames is None else frames
     if found.skeleton == LANDMARKS:
         detector = SharedDetector(detector)
-        data = detect(found, detector, frames=spread(len(found), _MOST_FRAMES))
+        data = detect(found, detector, frames=np.array(chosen)[spread(len(chosen), _MOST_FRAMES)])
     elif detector is not None:
         raise ValueError(f"detector (--weights): none knows {', '.join(found.skeleton)}; leave it out: labels are judged.")
     elif (marks := found.annotations) is not None:
-        data = of_recording(found, marks.u_left, marks.u_right)
+        data = of_recording(found, marks.u_left, marks.u_right).of_frames(chosen)
     else:
         raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
-    a = assess(found, data, detector=detector)
+    a = assess(found.showing(chosen), data, detector=detector)
     next_step = f"{_USE} -p recording RECORDING`."
+    if frames is not None:
+        next_step = f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
         next_step = found.mistimed if a.calibration is None and found.mistimed else next_step
@@ -163,11 +168,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("recording", type=Path, help="the recording's folder")
     parser.add_argument("--weights", metavar="FILE", help="of the detector (default: those that ship)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
+    parser.add_argument("--frames", metavar="A:B", help="look at the frames from A to before B alone, as Python's slices")
     a = parser.parse_args(argv)
     recording = Recording.open(a.recording, truth=False)
-    out = a.out or paths.results_folder(f"check-{a.recording.resolve().name}", a.recording)
-    found = check(recording, detector=Detector.load(a.weights) if a.weights else None)
+    some = {"frames": recording.frames_of(a.frames)} if a.frames else {}
+    part = "".join(f"-{frames.start}-{frames.stop}" for frames in some.values())
+    out = a.out or paths.results_folder(f"check-{a.recording.resolve().name}{part}", a.recording)
+    found = check(recording, detector=Detector.load(a.weights) if a.weights else None, **some)
     if a.weights:  # notebook 07 alone takes others than those that ship
-        found = replace(found, next_step=found.next_step.replace(_USE, f"{_USE} 07 -p weights {shlex.quote(a.weights)}"))
+        weights = shlex.quote(a.weights)
+        step = found.next_step.replace(_USE, f"{_USE} 07 -p weights {weights}")
+        found = replace(found, next_step=step.replace("lib calibrate", f"lib calibrate --weights {weights}"))
     print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {found.write(out)}")
     return 0

@@ -654,6 +654,19 @@ def test_failure_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("text", "frames"), [
+    (":", range(34)), ("0:17", range(17)), ("17:", range(17, 34)), ("-4:", range(30, 34)), ("30:99", range(30, 34)),
+    ("17", None), ("9:9", None), ("34:40", None), ("0:17:2", None), ("a:b", None), ("", None),
+])  # fmt: skip
+def test_frames_are_named_as_slices_are(text, frames):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    if frames is not None:
+        assert recording.frames_of(text) == frames
+        return
+    with pytest.raises(ValueError, match=rf"^--frames {text}: it names none of frames 0 to 33; give A:B, .* such as 0:17\.$"):
+        recording.frames_of(text)
+
+
 # --- what is suspicious is told at opening
 
 

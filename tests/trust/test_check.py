@@ -106,6 +106,26 @@ def test_a_second_check_reads_what_the_first_has_detected(folder, detector, tmp_
     assert counting.calls == calls >= 10 and again.to_json() == first.to_json()
 
 
+def test_a_part_is_checked_on_its_own(folder, detector, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(module.Detector, "load", lambda path: detector)
+    monkeypatch.setattr(paths, "RUNS", tmp_path)
+    looked = []
+    known = module.assess
+
+    def assess(recording, data, detector):
+        looked.append([recording.frames[i].left.tobytes() for i in range(len(recording))])
+        return known(recording, data, detector=detector)
+
+    monkeypatch.setattr(module, "assess", assess)
+    assert main([str(folder), "--frames", "2:8", "--weights", "some"]) == 0
+    content = json.loads((tmp_path / "check-small-2-8" / "check.json").read_text(encoding="utf-8"))
+    assert content["frames"]["frame"] == list(range(2, 8))
+    pictures = [frame.left.tobytes() for frame in Recording.open(folder, truth=False).frames]
+    assert looked == [[pictures[min(max(i, 2), 7)] for i in range(10)]]
+    step = f"Next: Use it: `python3 -m lib calibrate --weights some {folder} --frames 2:8`."
+    assert content["verdict"] != "trustworthy" or step in capsys.readouterr().out
+
+
 def test_a_folder_that_is_no_recording(tmp_path):
     with pytest.raises(FileNotFoundError, match="recording.toml"):
         check(tmp_path)
