@@ -79,7 +79,7 @@ def uncommented(text: str, separator: str = "") -> list[str]:
     filled = [i for i, line in enumerate(bare) if line.strip()][:2]
     if len(filled) == 2:
         head, below = (bare[i].split(separator or separator_of(bare[filled[0]])) for i in filled)
-        if len(head) == len(below) and not any(re.match(r"[-+.]?\d", cell.strip(' \t"')) for cell in below):
+        if len(head) == len(below) and not any(re.match(r"[-+.,]*\d", cell.strip(' \t"')) for cell in below):
             bare[filled[1]] = ""
     return bare
 

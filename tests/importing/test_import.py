@@ -279,13 +279,16 @@ def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
     assert "Times of the robot count from 34199 s." in did and recording.offset_s == 1
 
 
-def test_a_local_time_zone_is_named(shipped, tmp_path):
+@pytest.mark.parametrize(("late_s", "told"), [
+    (5400.0, r"\+1\.5 hours between them\? Then offset_s = 5400"),
+    (-3601.2, r"-1 hour between them\? Then offset_s = -3600"),
+])  # fmt: skip
+def test_a_local_time_zone_is_named(late_s, told, shipped, tmp_path):
     """Frames in Unix time, a log of dates without a zone."""
     few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6] + 1_700_000_000)
-    late = replace(few, robot_s=few.robot_s - few.robot_s[0] + 1_700_000_000 + 5400)
+    late = replace(few, robot_s=few.robot_s - few.robot_s[0] + 1_700_000_000 + late_s)
     folder, mapping = source_of(tmp_path, late, foreign.images, foreign.robot_csv)
-    cure = r"so that they overlap.* Is a time zone of \+1\.5 hours between them\? Then offset_s = 5400\.$"
-    with pytest.raises(ValueError, match=cure):
+    with pytest.raises(ValueError, match=rf"so that they overlap.* Is a time zone of {told}\.$"):
         import_recording(folder, mapping, tmp_path / "eye")
 
 
