@@ -118,13 +118,21 @@ def check(
     else:
         raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
     a = assess(found.showing(chosen), data, detector=detector)
-    next_step = f"{_USE} -p recording RECORDING`."
-    if frames is not None:
-        next_step = f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}`."
+    step = _next(found, a, frames).replace("RECORDING", shlex.quote(paths.shown(found.folder)))
+    return Check(found, a, _facts(found, a), step)
+
+
+def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
+    """What to do next: where no calibration holds and no cause beyond detector and robot is seen, first mend the times."""
+    best = a.diagnosis.best
+    vague = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
+    if vague and a.verdict.is_red and recording.mistimed:
+        return recording.mistimed
     if a.verdict.level != LEVELS[0]:
-        next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
-        next_step = found.mistimed if a.calibration is None and found.mistimed else next_step
-    return Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
+        return a.verdict.reasons[0].cure if best is None else best.cure
+    if frames is not None:
+        return f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}`."
+    return f"{_USE} -p recording RECORDING`."
 
 
 def _facts(recording: Recording, a: Assessment) -> dict[str, str]:

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -76,6 +77,11 @@ def test_where_nothing_is_calibrated_times_that_are_wrong_come_first(folder, det
     found = check(late, detector=detector)
     assert found.assessment.calibration is None
     assert found.next_step.startswith("The robot reports a position in 1 of 10 frames") and "adapt" not in found.next_step
+    for name, first in (("detector_unfit", True), ("robot_noise", True), ("mirrored_images", False)):
+        best = SimpleNamespace(name=name, cure="Flip it.")
+        calibrated = replace(found.assessment, calibration=object(), diagnosis=SimpleNamespace(best=best))
+        assert (module._next(late, calibrated, None) == late.mistimed) == first
+        assert module._next(recording, calibrated, None) == "Flip it."
 
 
 def test_the_next_step_names_the_weights_that_were_given(folder, detector, tmp_path, monkeypatch, capsys):
