@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -219,13 +219,10 @@ class Recording:
 
         So whoever looks at some pictures does not see where cameras stood before or after.
         """
-
-        def side(name: str) -> Callable[[int], np.ndarray]:
-            return lambda number: getattr(self.frames[min(max(number, frames[0]), frames[-1])], name)
-
         if len(frames) == len(self):
             return self
-        part = replace(self, frames=Frames(side("left"), side("right"), self.frames.time_s))
+        sides = [lambda i, side=side: getattr(self.frames[min(max(i, frames[0]), frames[-1])], side) for side in SIDES]
+        part = replace(self, frames=Frames(*sides, self.frames.time_s))
         part.__dict__["ground"] = self.ground  # that of the detections
         return part
 
