@@ -33,7 +33,7 @@ LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 FAULTS = {
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
     "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
-    "zoom_varies", "time_stamps", "backlash",
+    "zoom_varies", "time_stamps", "backlash", "odd_pixels",
 }  # fmt: skip
 _EXPLAINED = 0.15
 #: Residuals below this share of the tool's length hold no fault that matters, however well one explains them.

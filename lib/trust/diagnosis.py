@@ -150,7 +150,7 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     if not np.isfinite(time).all() or np.ptp(time) == 0:
         return
     late = ((time - time.mean()) / np.ptp(time))[:, None, None, None, None, None] * case.problem.of_cameras
-    cure = "Fix the microscope and the robot, or calibrate a shorter part (Correspondences.of_frames)."
+    cure = "Fix the microscope and the robot, or calibrate shorter parts (--frames A:B)."
     for columns, what in ((late[..., 3], "images creep"), (late, "cameras turn, zoom or move steadily: the images change")):
         fit = case.linear(columns.reshape(len(time), 2, 2, -1))
         moved_px = fit.moved_px[case.problem.used]
@@ -172,9 +172,9 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
     first = int(total[: last + 1].argmin())
     if 2 <= last - first <= 0.6 * case.frames:
         rows = (problem.frame >= first) & (problem.frame < last)
-        when = "{:.2f} to {:.2f} s".format(*problem.time[rows][[0, -1]])
-        cure = "Look at these frames and at the robot's log of this time, or leave them out (Correspondences.subset)."
-        parts.append(("bad_stretch", rows, 4, f"Frames {problem.number[first]} to {problem.number[last - 1]} ({when}) have", cure))
+        when = "{} to {} ({:.2f} to {:.2f} s)".format(*problem.number[[first, last - 1]], *problem.time[rows][[0, -1]])
+        cure = "Look at these frames and at the robot's log of this time, or leave them out (--frames A:B)."
+        parts.append(("bad_stretch", rows, 4, f"Frames {when} have", cure))
     for name, rows, extra, what, cure in parts:
         inside, outside = problem.used & rows[:, None], problem.used & ~rows[:, None]
         if not inside.any() or not outside.any():
@@ -197,6 +197,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
     exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
     number = problem.number[frame]  # in the recording
+    parts = f"--frames 0:{number}, --frames {number}:"
     text = f"From about frame {number} on, the left image is the right one."
     cure = "Exchange the images of these frames between left/ and right/."
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
@@ -206,7 +207,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     if fit.total > both.total - _AS_GOOD:
         size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
         text = f"The tool slipped at about frame {number}, by {size:.0f} um ({along} um in the tool's axes)."
-        cure = "Fix the tool in its holder, or calibrate before and after on their own. "
+        cure = f"Fix the tool in its holder, or calibrate before and after on their own ({parts}). "
         cure += "Where the tool does not turn, a robot whose zero changed looks the same."
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     for views in ((0, 1), (0,), (1,)):
@@ -215,7 +216,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved or zoomed at about frame {number}: the images shift by {size:.1f} px."
-        cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."
+        cure = f"Calibrate before and after on their own ({parts}). "
+        cure += "lib.registration.register_images follows a move, and no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)
         yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)
 

@@ -26,7 +26,7 @@ _INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
 _SURE_CURVED = 8.0  # stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 _ODD_PIXELS = "The cameras' pixels are skewed or oblong, and no axis of the robot is to blame: the jaws keep their lengths."
-_STEADY = "Look for what changes slowly while you record: microscope, clock, robot. Resized images do no harm."
+_STEADY = "Look for what bends, or changes while you record: shaft, microscope, clock. Resized images do no harm."
 #: Which the residuals do not show.
 BY_GEOMETRY = ("scaled_axis", "odd_pixels", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
 

@@ -327,7 +327,7 @@ def assess(
         elif best.name == "camera_moved" and (best.value > _NEARER_PX + _TIMES * moved_px).all():
             text = best.text.replace("Both cameras moved or zoomed", "Images and robot part")
             text += " What lies behind the tool stands still: the robot's report jumped."
-            jumped = replace(best, name="robot_jumped", text=text, cure="Calibrate before and after on their own.")
+            jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
             diagnosis = Diagnosis((jumped, *others))
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
