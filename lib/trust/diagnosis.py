@@ -393,7 +393,8 @@ def diagnose(
     if best is None:  # other faults look like offsets, too
         found += _landmark_offset(case)
         best = Diagnosis(found).best
-    fit = case.null if best is None else case.fits.get(best.name, case.null)
+    plain = best is None or best.name in OF_FRAMES  # numbers for each frame make wrong cameras fit
+    fit = case.null if plain else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
     if turned and not stands_exchanged(fit):
         found = [h for h in found if h.name != "turned_image"]
@@ -401,8 +402,9 @@ def diagnose(
         fit = case.null if best is None else case.fits.get(best.name, case.null)
     more = [] if near else list(finite_distance(case, fit))
     more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
-    if best is not None and best.explained > _MOSTLY:  # a fault of this size may skew the pixels; the next check tells
-        more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in _OF_PIXELS else h for h in more]
+    if best is not None:  # a fault of some size may skew the pixels; the next check tells
+        after = _OF_PIXELS if best.explained > _MOSTLY else _OF_PIXELS[1:]
+        more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in after else h for h in more]
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))

@@ -23,6 +23,7 @@ _DISTORTION_SD = 0.04  # at the corner, before the data
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 _INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
+_CURVED_FITS = 0.01  # misfit below which 1/distance tells something
 _SURE_CURVED = 8.0  # stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 _ODD_PIXELS = "The cameras' pixels are skewed or oblong, and no axis of the robot is to blame: the jaws keep their lengths."
@@ -81,7 +82,8 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
         accused, refuted = _jaws(case)
         yield from accused or (_scaled_axis(A, covariance, refuted) if told else ())
     if misfit < 2 * FITS:  # nor do they tell left from right
-        yield from _handedness(case, A, covariance, fit.nearness)
+        curved = fit.nearness if misfit < _CURVED_FITS else (0.0, np.inf)
+        yield from _handedness(case, A, covariance, curved)
 
 
 def _of_axes(fit: Robust, sign: float) -> tuple[np.ndarray, np.ndarray]:

@@ -600,7 +600,8 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("microscope sways", "12 px, slowly"): (("robot_noise",), _swaying(12.0, (0, 1), 4.0)),
     ("lenses breathe", "1 %"): (("zoom_varies",), _breathing(0.01, 1.7, (0, 1))),
     ("left lens breathes", "2 %"): (("zoom_varies",), _breathing(0.02, 0.9, (0,))),
-    **{("frames stamped apart", f"{1e3 * s:.0f} ms"): (("time_stamps",), _jittering(s)) for s in (0.02, 0.06)},
+    **{("frames stamped apart", f"{1e3 * s:.0f} ms"): (("time_stamps", "frame_order"), _jittering(s))
+       for s in (0.02, 0.06)},
     ("robot has backlash", "0.1 mm"): (("backlash",), _backlash(0.1)),
     ("eyes exchanged later", ""): (("exchanged_eyes",), _pixels(_exchanged_later)),
     ("clock", "3 s"): (("clock",), _set(offset_s=3.0)),
