@@ -200,7 +200,7 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
-    add("--frames", metavar="A:B", help="of the frames from A to before B alone, as Python's slices (default: of all)")
+    add("--frames", metavar="A:B", help="of the frames from A to before B (default: of all); --frames=-10: takes ten")
     add("--model", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ... (default: as the data show)")
     if name != "detect":  # they may be refused
         add("--force", action="store_true", help="write results whatever the verdict")
@@ -255,9 +255,9 @@ def _calibrated(
     if given:
         rig, (folder, verdict, _) = StereoRig.load(given), _beside(given, a.frame)
         if folder != str(recording.folder.resolve()):
-            text = f"{given} was not calibrated or registered with this recording, or with other frames of it, and nothing "
-            text += "here tests it."
-            register = shlex.join(["python3", "-m", "lib", "register", str(a.recording), "--rig", str(given)])
+            text = f"{given}: nothing here tells that this rig fits this frame."
+            same = [f"--{name}={value}" for name in ("weights", "landmarks") if (value := getattr(a, name, None))]
+            register = shlex.join(["python3", "-m", "lib", "register", str(a.recording), "--rig", str(given), *same])
             cure = f"Run: {register}; then give the moved_rig.json that it writes as --rig."
             verdict = Verdict((Reason("rig_given", LEVELS[1], text, cure),))
     else:

@@ -109,7 +109,7 @@ def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
     """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
     time = next(filter(_TIME.search, columns), next(iter(columns)))
     if any(":" in cell for cell in columns[time][:1]):
-        return {"time": time, "time_unit": "hms" if re.match(r"\d\d?:", columns[time][0]) else "iso"}
+        return {"time": time, "time_unit": "hms" if re.match(r"\d\d?:\d\d?:", columns[time][0]) else "iso"}
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}
     step = np.nanmedian(np.diff(_numbers(columns[time][:100], decimal))) if len(columns[time]) > 1 else 0.0

@@ -66,7 +66,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         cure = f"a number from {low:.3f} to {high:.3f}, so that they overlap (t_robot = t_video + offset_s)"
         cure += ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
         half_hours = int(float(high) // 1800)  # the most that make them overlap
-        if all(zeros) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
+        if (all(zeros) or all(of_day)) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
             hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
             cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
         cure = f"Set robot.offset_s (now {told.robot.offset_s!r}) in {mapping} to {cure}"

@@ -79,7 +79,8 @@ def uncommented(text: str, separator: str = "") -> list[str]:
     filled = [i for i, line in enumerate(bare) if line.strip()][:2]
     if len(filled) == 2:
         head, below = (bare[i].split(separator or separator_of(bare[filled[0]])) for i in filled)
-        if len(head) == len(below) and not any(re.match(r"[-+.,]*\d", cell.strip(' \t"')) for cell in below):
+        words = [cell for cell in below if re.search(r"[^\W\d_]", cell) and not re.fullmatch(r"(?i)\W*(nan|inf)\W*", cell)]
+        if len(head) == len(below) and words and not any(re.search(r"^\W*\d", cell) for cell in below):
             bare[filled[1]] = ""
     return bare
 

@@ -206,11 +206,11 @@ class Recording:
         return " ".join(f"{doubt.text} {doubt.cure}" for doubt in of_time)
 
     def frames_of(self, text: str) -> range:
-        """The frames that --frames names by "A:B", from A to before B as Python's slices; a ValueError if it names none."""
+        """The frames that --frames names by "A:B", from A to before B, negative from the end; a ValueError without any."""
         ends = re.fullmatch(r"(-?\d+)?:(-?\d+)?", text)
         frames = range(len(self))[slice(*(int(end) if end else None for end in ends.groups()))] if ends else range(0)
         if not frames:
-            what = f"it names none of frames 0 to {len(self) - 1}"
+            what = f"it names none of frames 0 to {len(self) - 1}" if ends else "two numbers and a colon are needed"
             raise ValueError(f"--frames {text}: {what}; give A:B, from A to before B, such as 0:{max(len(self) // 2, 1)}.")
         return frames
 

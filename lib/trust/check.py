@@ -131,7 +131,8 @@ def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
     if a.verdict.level != LEVELS[0]:
         return a.verdict.reasons[0].cure if best is None else best.cure
     if frames is not None:
-        return f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}`."
+        labels = "" if recording.skeleton == LANDMARKS else " --landmarks annotations"
+        return f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}{labels}`."
     return f"{_USE} -p recording RECORDING`."
 
 
@@ -176,7 +177,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("recording", type=Path, help="the recording's folder")
     parser.add_argument("--weights", metavar="FILE", help="of the detector (default: those that ship)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
-    parser.add_argument("--frames", metavar="A:B", help="look at the frames from A to before B alone, as Python's slices")
+    parser.add_argument("--frames", metavar="A:B", help="look at the frames from A to before B; --frames=-10: takes ten")
     a = parser.parse_args(argv)
     recording = Recording.open(a.recording, truth=False)
     some = {"frames": recording.frames_of(a.frames)} if a.frames else {}

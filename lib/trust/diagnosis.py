@@ -197,7 +197,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
     exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
     number = problem.number[frame]  # in the recording
-    parts = f"--frames 0:{number}, --frames {number}:"
+    parts = f"--frames {problem.number[0]}:{number}, --frames {number}:{problem.number[-1] + 1}"
     text = f"From about frame {number} on, the left image is the right one."
     cure = "Exchange the images of these frames between left/ and right/."
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")

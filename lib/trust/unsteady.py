@@ -13,6 +13,7 @@ from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
 
 _FEWEST_FRAMES = 8
 _ROUNDS, _STEPS = 8, 10  # of cameras beside the numbers, and of the numbers' deviation beside given cameras
+_OF_ZOOM = 0.6  # of the detector's errors, by which a zoom must move landmarks: those that they share look less like one
 _MOST = 0.5  # by so much of its RMS a number must differ from 0 in most frames: gross errors are in a part of them
 
 
@@ -43,17 +44,22 @@ def unsteady_robot(case: Case) -> Iterator[Hypothesis]:
         return
     found = _by_frame(case, lambda M: np.broadcast_to(M[:, :, :3], (len(problem), 2, 2, 3)), 0.05)
     size = np.sqrt(3.0) * found.sd
-    if found.in_most and found.moved_px > problem.claimed_px() and size > case.robot_mm:
+    if found.in_most and found.moved_px > _claimed_px(case) and size > case.robot_mm:
         text = f"From frame to frame images and robot part by {size:.2g} mm (RMS), all landmarks alike."
         cure = "Fix the microscope and the robot's base; check times, units and columns of kinematics.csv."
         yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
     if case.paths:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
-        if found.in_most and found.moved_px > problem.claimed_px():
+        if found.in_most and found.moved_px > _claimed_px(case):
             text = f"The times of the frames err by {1e3 * found.sd:.2g} ms (RMS), each by itself, or those of the log do."
             cure = "Write down when the camera exposed each frame, and the robot measured each position; do not round."
             yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
+
+
+def _claimed_px(case: Case) -> float:
+    """The distance by which the detector may err, as it says or the residuals do: shared errors look like these causes."""
+    return case.problem.claimed_px() or np.sqrt(2.0) * case.null.shapes[0].scale
 
 
 def _still(case: Case) -> bool:
@@ -76,7 +82,7 @@ def unsteady_images(case: Case) -> Iterator[Hypothesis]:
     ):  # fmt: skip
         moved = np.concatenate([columns * (np.arange(2) == view)[:, None, None] for view in views], axis=3)
         found = _by_frame(case, lambda M, moved=moved: moved, sd)
-        if found.in_most and (unit == "%" or found.moved_px > problem.claimed_px()):
+        if found.in_most and found.moved_px > (_OF_ZOOM if unit == "%" else 1.0) * _claimed_px(case):
             who = "Each image" if len(views) == 2 else f"The {SIDES[views[0]]} image alone"
             size = found.sd * np.sqrt(columns.shape[3])
             text = f"{who} {does} from frame to frame, by {size:.2g} {unit} (RMS)."
@@ -119,7 +125,8 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
         moved = replace(problem, y=problem.y - shift)
         fit = moved.fit(start=fit.start, rounds=5)
     chosen = 0.5 * float(np.linalg.slogdet(np.eye(k) + sd**2 * H)[1].sum() + ((theta / sd) ** 2).sum())
-    moved_px = float(np.sqrt((shift**2).sum(axis=2)[problem.used & (shift != 0).any(axis=2)].mean()))
+    own = problem.used & (shift != 0).any(axis=2)
+    moved_px = float(np.sqrt((shift**2).sum(axis=2)[own].mean())) if own.any() else 0.0
     return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
 
 
