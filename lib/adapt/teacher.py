@@ -24,6 +24,7 @@ from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
+from lib.trust.diagnosis import stated
 from lib.trust.fitting import Problem
 
 #: Least share of the landmarks that must agree on the cameras, and of the views of one that show it where the robot says;
@@ -412,9 +413,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    names = "kinematics offset_s readout_s image_size_px robot_accuracy_mm".split()
-    how = {name: getattr(recording, name) for name in names}
-    best = diagnose(rows, near=True, offsets=calibration.offsets, **how).best
+    best = diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 
 

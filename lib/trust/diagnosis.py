@@ -15,7 +15,7 @@ from scipy.ndimage import binary_opening, median_filter
 
 from lib.calibration import LandmarkOffsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
-from lib.recordings import Kinematics
+from lib.recordings import Kinematics, Recording
 from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
@@ -336,6 +336,12 @@ class Diagnosis:
         return max((h for h in self.hypotheses if h.is_named), key=lambda h: h.gain, default=None)
 
 
+def stated(recording: Recording) -> dict[str, object]:
+    """What a recording states, as `diagnose` takes it."""
+    names = ("kinematics", "offset_s", "readout_s", "image_size_px", "robot_accuracy_mm")
+    return {name: getattr(recording, name) for name in names}
+
+
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
     image_size_px: tuple[int, int] | None = None, near: bool = False, offsets: LandmarkOffsets | None = None,
@@ -376,13 +382,13 @@ def diagnose(
     if moved_px < _STILL_PX and moved_mm > _STILL_MM:
         text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    stated = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
-    whole = case = Case(problem, *stated)
+    log = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
+    whole = case = Case(problem, *log)
     # Where a tool rests its detections repeat one error, which is no fault that begins or ends there.
     x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)
     kept[_RESTS:] = np.linalg.norm(x_mm[_RESTS:] - x_mm[:-_RESTS], axis=2).max(axis=1) > _RESTS_MM
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
-        case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *stated)
+        case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *log)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _tool_length, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, *FRAME_TESTS]
@@ -393,13 +399,12 @@ def diagnose(
     if best is None:  # other faults look like offsets, too
         found += _landmark_offset(case)
         best = Diagnosis(found).best
-    plain = best is None or best.name in OF_FRAMES  # numbers for each frame make wrong cameras fit
-    fit = case.null if plain else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
-    if turned and not stands_exchanged(fit):
+    if turned and not stands_exchanged(case.fits[best.name]):
         found = [h for h in found if h.name != "turned_image"]
         best, turned = Diagnosis(found).best, False
-        fit = case.null if best is None else case.fits.get(best.name, case.null)
+    plain = best is None or best.name in OF_FRAMES  # numbers for each frame make wrong cameras fit
+    fit = case.null if plain else case.fits.get(best.name, case.null)
     more = [] if near else list(finite_distance(case, fit))
     more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
     if best is not None:  # a fault of some size may skew the pixels; the next check tells

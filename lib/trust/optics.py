@@ -23,13 +23,12 @@ _DISTORTION_SD = 0.04  # at the corner, before the data
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 _INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
+#: Stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6.
+SURE_CURVED = 8.0
 _CURVED_FITS = 0.01  # misfit below which 1/distance tells something
-_SURE_CURVED = 8.0  # stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 _ODD_PIXELS = "The cameras' pixels are skewed or oblong, and no axis of the robot is to blame: the jaws keep their lengths."
 _STEADY = "Look for what bends, or changes while you record: shaft, microscope, clock. Resized images do no harm."
-#: Which the residuals do not show.
-BY_GEOMETRY = ("scaled_axis", "odd_pixels", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
 
 
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
@@ -217,7 +216,7 @@ def _handedness(
     near, known, (curved, curved_sd) = int((ahead < -_ACROSS).sum()), np.isfinite(ahead).sum(), nearness
     share = (near - int((ahead > _ACROSS).sum())) / max(known, 1)
     apart_s = np.ptp(case.problem.time) if np.isfinite(case.problem.time).all() else np.inf
-    if abs(curved) > _SURE_CURVED * curved_sd:
+    if abs(curved) > SURE_CURVED * curved_sd:
         mirrored, how = curved < 0, "farther things look larger"
         gain = 0.5 * (curved / curved_sd) ** 2
     else:
@@ -240,5 +239,5 @@ def _handedness(
         text = f"The world looks mirrored, since {how}. Then heights and distances have the wrong sign."
         cure = "Flip both images, and undo what was done to the tips' order; or, if the images are right, use a right-handed "
         cure += "robot frame and exchange left/ and right/. Where the tool does point so, --force goes on."
-        explained = 1.0 if abs(curved) > _SURE_CURVED * curved_sd else share
+        explained = 1.0 if abs(curved) > SURE_CURVED * curved_sd else share
         yield Hypothesis("mirrored_images", text, cure, 100.0 * share, 0.0, "%", explained, float(gain))

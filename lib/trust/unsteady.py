@@ -1,6 +1,7 @@
-"""Hypotheses of numbers that each frame has for itself: jaws, clocks, images, zooms and robots that do not keep still.
+"""Hypotheses about what changes from frame to frame: jaws, clocks, images, zooms and robots that do not keep still.
 
-The numbers of the frames are normal, of one standard deviation, which is estimated; the evidence integrates over them.
+Each frame has a number of its own, or a few.  These are normal with one standard deviation, which is estimated; the evidence
+of a hypothesis integrates over them.
 """
 
 from collections.abc import Callable, Iterator
@@ -37,52 +38,35 @@ def is_constant(width_mm: np.ndarray) -> bool:
     return bool(width_mm.std() <= max(0.02 * width_mm.mean(), 0.03))
 
 
-def unsteady_robot(case: Case) -> Iterator[Hypothesis]:
-    """The robot's report and the images part from frame to frame, all landmarks alike: along its path, or anyhow."""
+def unsteady(case: Case) -> Iterator[Hypothesis]:
+    """Robot and images part from frame to frame, all landmarks alike: anyhow, or in time; or an image sways, or zooms."""
     problem = case.problem
-    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0 or _still(case):
+    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0:  # too little to tell such numbers from noise
         return
     found = _by_frame(case, lambda M: np.broadcast_to(M[:, :, :3], (len(problem), 2, 2, 3)), 0.05)
-    size = np.sqrt(3.0) * found.sd
-    if found.in_most and found.moved_px > _claimed_px(case) and size > case.robot_mm:
+    size, each = np.sqrt(3.0) * found.sd, [problem.x[problem.landmark == k, 0] for k in np.unique(problem.landmark)]
+    moves = max(np.ptp(x, axis=0).max() for x in each) > case.robot_mm
+    if moves and _tells(case, found) and size > case.robot_mm:
         text = f"From frame to frame images and robot part by {size:.2g} mm (RMS), all landmarks alike."
         cure = "Fix the microscope and the robot's base; check times, units and columns of kinematics.csv."
         yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
-    if case.paths:
+    if moves and case.paths:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
-        if found.in_most and found.moved_px > _claimed_px(case):
+        if _tells(case, found):
             text = f"The times of the frames err by {1e3 * found.sd:.2g} ms (RMS), each by itself, or those of the log do."
             cure = "Write down when the camera exposed each frame, and the robot measured each position; do not round."
             yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
-
-
-def _claimed_px(case: Case) -> float:
-    """The distance by which the detector may err, as it says or the residuals do: shared errors look like these causes."""
-    return case.problem.claimed_px() or np.sqrt(2.0) * case.null.shapes[0].scale
-
-
-def _still(case: Case) -> bool:
-    """Whether the robot's positions of each landmark are one."""
-    each = [case.problem.x[case.problem.landmark == k, 0] for k in np.unique(case.problem.landmark)]
-    return max(np.ptp(x, axis=0).max() for x in each) < case.robot_mm
-
-
-def unsteady_images(case: Case) -> Iterator[Hypothesis]:
-    """An image that sways, or one or two that zoom."""
-    problem = case.problem
-    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0:
-        return
     shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
     zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
-    sways = shift, 3.0, "px", "image_sways", "sways", "Fix that camera, and turn off stabilisation of the image."
-    zooms = zoom, 1.0, "%", "zoom_varies", "zooms in and out", "Record without autofocus, at one zoom."
-    for views, (columns, sd, unit, name, does, cure) in (
+    sways = shift, 3.0, 1.0, "px", "image_sways", "sways", "Fix that camera, and turn off stabilisation of the image."
+    zooms = zoom, 1.0, _OF_ZOOM, "%", "zoom_varies", "zooms in and out", "Record without autofocus, at one zoom."
+    for views, (columns, sd, share, unit, name, does, cure) in (
         ((0,), sways), ((1,), sways), ((0, 1), zooms), ((0,), zooms), ((1,), zooms)
     ):  # fmt: skip
         moved = np.concatenate([columns * (np.arange(2) == view)[:, None, None] for view in views], axis=3)
         found = _by_frame(case, lambda M, moved=moved: moved, sd)
-        if found.in_most and found.moved_px > (_OF_ZOOM if unit == "%" else 1.0) * _claimed_px(case):
+        if _tells(case, found, share):
             who = "Each image" if len(views) == 2 else f"The {SIDES[views[0]]} image alone"
             size = found.sd * np.sqrt(columns.shape[3])
             text = f"{who} {does} from frame to frame, by {size:.2g} {unit} (RMS)."
@@ -90,23 +74,27 @@ def unsteady_images(case: Case) -> Iterator[Hypothesis]:
 
 
 class _Numbers(NamedTuple):
-    """Of the frames, N(0, sd^2): the fit beside them, theta (frames, k), by how much they move the pixels (RMS)."""
+    """The frames' numbers theta (frames, k), normal with deviation sd, the fit beside them, and how far they move pixels."""
 
     fit: Robust
     theta: np.ndarray
     sd: float
-    moved_px: float
+    moved_px: float  # RMS
     raw: float  # gain in log likelihood, theta integrated out
 
-    @property
-    def in_most(self) -> bool:
-        """Whether they differ from 0 in most frames."""
-        size2 = (self.theta**2).sum(axis=1)
-        return bool(np.median(size2) > _MOST**2 * size2.mean())
+
+def _tells(case: Case, found: _Numbers, share: float = 1.0) -> bool:
+    """Whether most frames have such a number, and these move pixels by more than a share of what the detector may err by.
+
+    Errors that the landmarks of a frame share look like these causes.
+    """
+    size2, claimed_px = (found.theta**2).sum(axis=1), case.problem.claimed_px()
+    claimed_px = claimed_px or np.sqrt(2.0) * case.null.shapes[0].scale  # by the residuals, where it says nothing
+    return bool(np.median(size2) > _MOST**2 * size2.mean() and found.moved_px > share * claimed_px)
 
 
 def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float) -> _Numbers:
-    """Numbers of the frames that move the pixels by columns(M) (n, 2, 2, k) theta; `sd` is a first guess."""
+    """The numbers of the frames of which each moves pixels by a column of columns(M) (n, 2, 2, k); `sd` is a first guess."""
     problem = moved = case.problem
     fit = case.null
     for _ in range(_ROUNDS):
@@ -130,7 +118,7 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
     return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
 
 
-#: Which have numbers for each frame that whiten the residuals of any fault.
+#: Causes that have so many numbers that they leave white residuals, whatever is wrong.
 OF_FRAMES = ("robot_noise", "time_stamps", "image_sways", "zoom_varies")
 #: They need nothing but the rows, and the tool's path in time where there is one.
-FRAME_TESTS = (rigid_tips, unsteady_robot, unsteady_images)
+FRAME_TESTS = (rigid_tips, unsteady)

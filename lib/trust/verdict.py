@@ -15,9 +15,9 @@ from lib.calibration.checks import extents
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording, Scene
-from lib.trust.diagnosis import Diagnosis, diagnose
+from lib.trust.diagnosis import Diagnosis, diagnose, stated
 from lib.trust.health import BY_ROBOT, Health, feature_matches, health, spread
-from lib.trust.optics import BY_GEOMETRY
+from lib.trust.optics import SURE_CURVED
 
 #: From best to worst.
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
@@ -43,8 +43,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "roll": (30.0, 90.0),
     # One image is a mirror image (1) or not (0).
     "mirrored": (0.5, np.inf),
-    # Standard deviations of 1/distance below 0; errors that last make it 6.
-    "hollow": (8.0, 10.0),
+    # Standard deviations of 1/distance below 0, as which farther things look larger.
+    "hollow": (SURE_CURVED, SURE_CURVED + 2.0),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
     "coverage": (1.5, np.inf),
     # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
@@ -140,7 +140,7 @@ def judge(
     best = None if diagnosis is None else diagnosis.best
     if best is not None:
         text = best.text
-        if best.name not in (*BY_GEOMETRY, "detector_unfit", "robot_noise"):
+        if best.evidence is not None and best.name != "landmark_offset":
             text += f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
@@ -309,15 +309,13 @@ def assess(
         features = calibration.pair.triangulate(y[:, :2], y[:, 2:])
         known = np.isfinite(features.x_mm).all(axis=1)
         epipolar_px, at_mm = float(np.median(np.abs(features.epipolar_px))), features.x_mm[known] if known.any() else None
-    names = "kinematics offset_s readout_s image_size_px robot_accuracy_mm".split()
-    stated = {name: getattr(recording, name) for name in names}
     straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
     if near:  # a lens that distorts is no fault either, and what the robot parks behind a camera is seen nowhere
         left, right = calibration.cameras
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
-    diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated)
+    diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
     if (best := diagnosis.best) is not None and best.name in ("camera_moved", "tool_slipped") and len(best.images) == 2:
         pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
         first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
