@@ -9,8 +9,10 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
+from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
 #: A scheduler must answer within these seconds.
@@ -73,6 +75,21 @@ def single_threaded_torch() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def single_threaded_blas() -> Iterator[None]:
+    """Run the block, or the function that this decorates, with one thread of numpy's and scipy's linear algebra.
+
+    For many small matrices more threads gain nothing, and where cores are busy they wait for each other.
+    """
+    with _loaded_libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@cache
+def _loaded_libraries() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def _work(function: Callable, path: Path, *arguments: object) -> None:

@@ -20,6 +20,7 @@ from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
+from lib.parallel import single_threaded_blas
 
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
 _OFFSET_ROWS = 12
@@ -32,6 +33,7 @@ _AS_LIKELY = 3.0
 _FINITE, _STEP_PER_MM = 3.0, 1e-6
 
 
+@single_threaded_blas()
 def calibrate(
     data: Correspondences | ArrayLike, u: Sequence[ArrayLike] | None = None, *,
     offsets: bool | Literal["tool", "image"] | None = None, offset_prior_sd: float | None = None,

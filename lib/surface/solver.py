@@ -5,20 +5,19 @@ narrow band of the spline's own grid.  `interior_point` takes a dozen factorisat
 """
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg.lapack import dpbtrf, dpbtrs
-from threadpoolctl import ThreadpoolController
 
+from lib.parallel import single_threaded_blas
 from lib.surface.grid import SplineGrid, cubic_basis
 
 UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control points."
 )
 _PAIRS = np.triu_indices(4)
-_blas = cache(ThreadpoolController)
 
 
 class L1Problem:
@@ -98,8 +97,7 @@ def interior_point(
     """
     weights = np.ones_like(x) if weights is None else weights
     columns = zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
-    # Narrow bands gain nothing from more threads, and where cores are busy these wait for each other.
-    with _blas().limit(limits=1, user_api="blas"):
+    with single_threaded_blas():
         outputs = [_interior_point(problem, *column, tolerance, max_iterations) for column in columns]
     coefficients, objective, gap, dual = zip(*outputs, strict=True)
     return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), np.stack(dual, 1))

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from lib.calibration.timing import shift_misfits
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust
 
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
@@ -146,7 +146,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
         moved = replace(case.problem, x=x)
         if (order == number).all() or moved.used.all(axis=1).sum() < 6:
             continue
-        fit = moved.fit()
+        fit = moved.fit(worth=case.null.total - HOPELESS)
         what = "images" if len(views) == 2 else f"{SIDES[views[0]]} images"
         text = f"The {what} are sorted by their names as text: {'1' if first else '0, 1'}, 10, 11, ... before 2."
         cure = "Sort them by number, or give the names leading zeros: 000, 001, 002, ..."

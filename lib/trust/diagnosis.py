@@ -15,9 +15,10 @@ from scipy.ndimage import binary_opening, median_filter
 
 from lib.calibration import LandmarkOffsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
+from lib.parallel import single_threaded_blas
 from lib.recordings import Kinematics, Recording
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
 from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, is_constant
@@ -57,7 +58,8 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
         mirrored = "both images are mirrored, flip them" if len(views) == 2 else "that image is mirrored, flip it"
         cure += f" If {mirrored} instead." if order == (0, 2, 1) else ""
-        yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved, images=views)
+        fit = moved.fit(worth=case.null.total - HOPELESS)
+        yield case.found("tip_order", fit, 1, (1.0, 0.0, ""), text, cure, on=moved, images=views)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
     if not own.any():  # it only found better cameras than `null`
@@ -342,6 +344,7 @@ def stated(recording: Recording) -> dict[str, object]:
     return {name: getattr(recording, name) for name in names}
 
 
+@single_threaded_blas()
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
     image_size_px: tuple[int, int] | None = None, near: bool = False, offsets: LandmarkOffsets | None = None,

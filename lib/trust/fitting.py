@@ -25,6 +25,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
+HOPELESS = 20.0  # log likelihood that the samples of a fit lack which never beats "nothing is wrong"
 _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a robot for eye surgery errs by less, and by less than so often what is stated
@@ -146,11 +147,12 @@ class Problem:
 
     def fit(
         self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
-        apart: np.ndarray | None = None, rounds: int = 40,
+        apart: np.ndarray | None = None, rounds: int = 40, worth: float = -np.inf,
     ) -> Robust:  # fmt: skip
         """Most probable cameras, offsets and additions, near a `Robust.start` or the best sample of four rows.
 
         `columns` (n, 2, 2, k) (or cameras M -> columns): what each addition does to pixels; rows `apart` have another noise.
+        Samples whose log likelihood stays below `worth` are not followed to the end.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:  # of least squares, or of the samples of four rows that most rows are near to
@@ -162,7 +164,10 @@ class Problem:
                     cameras[0, view] = regress(x, y)
                     with suppress(ValueError):  # positions in one plane
                         cameras[1, view] = tightest_sample(x, y, rng)
-            start = max((self._descend(beta, columns, apart, 8) for beta in starts), key=lambda fit: fit.total).start
+            best = max((self._descend(beta, columns, apart, 8) for beta in starts), key=lambda fit: fit.total)
+            if best.total < worth:
+                return best
+            start = best.start
         return self._descend(start, columns, apart, rounds)
 
     def of_later_cameras(self, frame: int, views: tuple[int, ...] = (0, 1)) -> np.ndarray:
@@ -348,12 +353,14 @@ class Case:
 
     def chosen(self, x: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray]:
         """Each frame, in some images, with its best of positions x (t, n, 3): the fit, its rows, the choices (frames,)."""
-        problem, fit = self.problem, self.null
+        problem, fit, own = self.problem, self.null, np.full(self.frames, -1)
         for _ in range(5):
             r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0)
             loss = loss[:, :, views].sum(axis=2)
-            own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+            before, own = own, np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+            if (own == before).all():
+                break
             positions = problem.x.copy()
             positions[:, views] = x[own[problem.frame], np.arange(len(problem))][:, None]
             moved = replace(problem, x=positions)

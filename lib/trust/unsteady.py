@@ -14,6 +14,7 @@ from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
 
 _FEWEST_FRAMES = 8
 _ROUNDS, _STEPS = 8, 10  # of cameras beside the numbers, and of the numbers' deviation beside given cameras
+_GROWS = 1.02  # numbers that tell nothing yet must move the pixels by so much more than in the round before
 _OF_ZOOM = 0.6  # of the detector's errors, by which a zoom must move landmarks: those that they share look less like one
 _MOST = 0.5  # by so much of its RMS a number must differ from 0 in most frames: gross errors are in a part of them
 
@@ -88,15 +89,19 @@ def _tells(case: Case, found: _Numbers, share: float = 1.0) -> bool:
 
     Errors that the landmarks of a frame share look like these causes.
     """
-    size2, claimed_px = (found.theta**2).sum(axis=1), case.problem.claimed_px()
-    claimed_px = claimed_px or np.sqrt(2.0) * case.null.shapes[0].scale  # by the residuals, where it says nothing
-    return bool(np.median(size2) > _MOST**2 * size2.mean() and found.moved_px > share * claimed_px)
+    size2 = (found.theta**2).sum(axis=1)
+    return bool(np.median(size2) > _MOST**2 * size2.mean() and found.moved_px > share * _claimed_px(case))
+
+
+def _claimed_px(case: Case) -> float:
+    """By how much the detector may err: as it says, else by the residuals."""
+    return case.problem.claimed_px() or np.sqrt(2.0) * case.null.shapes[0].scale
 
 
 def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float) -> _Numbers:
     """The numbers of the frames of which each moves pixels by a column of columns(M) (n, 2, 2, k); `sd` is a first guess."""
     problem = moved = case.problem
-    fit = case.null
+    fit, moved_px = case.null, 0.0
     for _ in range(_ROUNDS):
         D, shape = columns(fit.M), fit.shapes[0]
         k, r2 = D.shape[3], (fit.residuals**2).sum(axis=2) / problem.noise**2
@@ -105,16 +110,21 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
         H, b = np.zeros((case.frames, k, k)), np.zeros((case.frames, k))
         np.add.at(H, problem.frame, np.einsum("nc,ncia,ncib->nab", weight, D, D))
         np.add.at(b, problem.frame, np.einsum("nc,ncia,nci->na", weight, D, left))
+        H, axes = np.linalg.eigh(H)  # (frames, k), and the axes along which the numbers of a frame are independent
+        b = (b[:, None] @ axes)[:, 0]
         for _ in range(_STEPS):
-            C = np.linalg.inv(H + np.eye(k) / sd**2)
-            theta = (C @ b[..., None])[..., 0]
-            sd = max(float(np.sqrt((theta**2 + np.diagonal(C, axis1=1, axis2=2)).mean())), 1e-6)
+            variance = 1.0 / (H + sd**-2)
+            theta = variance * b
+            sd = max(float(np.sqrt((theta**2 + variance).mean())), 1e-6)
+        theta = (axes @ theta[..., None])[..., 0]
         shift = np.einsum("ncia,na->nci", D, theta[problem.frame])
         moved = replace(problem, y=problem.y - shift)
         fit = moved.fit(start=fit.start, rounds=5)
-    chosen = 0.5 * float(np.linalg.slogdet(np.eye(k) + sd**2 * H)[1].sum() + ((theta / sd) ** 2).sum())
-    own = problem.used & (shift != 0).any(axis=2)
-    moved_px = float(np.sqrt((shift**2).sum(axis=2)[own].mean())) if own.any() else 0.0
+        own, before_px = problem.used & (shift != 0).any(axis=2), moved_px
+        moved_px = float(np.sqrt((shift**2).sum(axis=2)[own].mean())) if own.any() else 0.0
+        if moved_px < min(_GROWS * before_px, _claimed_px(case)):
+            break
+    chosen = 0.5 * float(np.log1p(sd**2 * H).sum() + ((theta / sd) ** 2).sum())
     return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
 
 
