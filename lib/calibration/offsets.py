@@ -28,7 +28,7 @@ from lib.geometry import cross
 _STEP = 1e-4
 #: Largest offset, from the mean of all, that may explain two cameras, and largest one that may explain a landmark which
 #: agrees with no camera of the others: what is farther off is another point of the tool.
-_MOST_MM, _MOST_ALONE_MM = 0.4, 0.25
+_MOST_MM, _MOST_ALONE_MM = 0.8, 0.25
 #: So many first steps use every detection; later ones drop those that fit another camera.
 _TAKEN = 4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.

@@ -74,10 +74,11 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
     sizes = 1e3 * np.linalg.norm(free.offsets, axis=1)
-    size, sd, k = sizes.max(), 1e3 * free.offset_sd[sizes.argmax()], sizes.argmax()
+    size, sd = sizes.max(), 1e3 * free.offset_sd[sizes.argmax()]
     if size - 2.0 * sd > _LEAST_OFFSET_UM:
-        along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
-        text = f"{LANDMARKS[k]} is seen {size:.0f} um beside the robot's report ({along} um in the tool's axes)."
+        far = [k for k in np.argsort(-sizes) if sizes[k] > 2e3 * free.offset_sd[k]]
+        each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in free.offsets[k])})" for k in far]
+        text = f"The images show beside the robot's report, in the tool's axes: {'; '.join(each)}."
         cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
         certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # cameras with offsets have no residuals of them
