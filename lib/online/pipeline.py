@@ -7,6 +7,7 @@ frame is reconstructed, and its landmarks show whether the cameras moved, or wha
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -174,31 +175,34 @@ class OnlinePipeline:
             self._ground = GrowingGround()
         images, previous = np.stack([left, right], out=self._pair), self._seen
         self._seen = None  # whatever fails now, the next frame is searched as a whole
-        known = with_ground(self._detector, self._ground)
+        paired, known = self._pairing(kinematics), with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
         guides = hasattr(self._detector, "near") and getattr(self._detector, "tool_network", True) is not None
-        told = self._told_px(kinematics) if guides else None
+        told = self._told_px(paired) if guides else None
         previous = self._guided(images, previous, told, known) if follow else previous
         found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
         self._seen = found = self._guided(images, found, told, known)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
-        index = np.full(len(LANDMARKS), self._index)
-        if callable(kinematics):
+        return Seen(paired(self.rig, u, **stated), partial(paired, u=u, **stated))
 
-            def pair(rig: StereoRig | None) -> Correspondences:
-                linear = None if rig is None else rig.linear
-                rows = kinematics(u[:1], u[1:], linear=linear, **{name: values[None] for name, values in stated.items()})
-                if not isinstance(rows, Correspondences) or rows.landmark.tolist() != list(range(len(LANDMARKS))):
-                    raise ValueError("kinematics: expected a function that returns the Correspondences of one frame.")
-                return replace(rows, frame=index)
+    def _pairing(self, kinematics: ArrayLike | Callable | None) -> Callable[..., Correspondences]:
+        """A function that pairs this frame's landmarks u (2, 3, 2) px, by a rig, with `kinematics` as `step` takes them."""
+        index, landmarks = np.full(len(LANDMARKS), self._index), list(range(len(LANDMARKS)))
+        if not callable(kinematics):
+            x_mm = np.full((3, 3), np.nan) if kinematics is None else np.array(kinematics, dtype=np.float64)
+            if x_mm.shape != (3, 3):
+                raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x_mm.shape}.")
+            return lambda rig, u, **stated: Correspondences.of_points(x_mm, *u, frame=index, landmark=landmarks, **stated)
 
-            return Seen(pair(self.rig), pair)
-        x = np.full((3, 3), np.nan) if kinematics is None else np.array(kinematics, dtype=np.float64)
-        if x.shape != (3, 3):
-            raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
-        data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
-        return Seen(data, lambda rig: data)
+        def paired(rig: StereoRig | None, u: np.ndarray, **stated: np.ndarray) -> Correspondences:
+            of_one = {name: values[None] for name, values in stated.items()}
+            rows = kinematics(u[:1], u[1:], linear=None if rig is None else rig.linear, **of_one)
+            if not isinstance(rows, Correspondences) or rows.landmark.tolist() != landmarks:
+                raise ValueError("kinematics: expected a function that returns the Correspondences of one frame.")
+            return replace(rows, frame=index)
+
+        return paired
 
     def _guided(self, images: np.ndarray, found: Landmarks, told: np.ndarray | None, known: dict) -> Landmarks:
         """`found`, and what is seen where the robot has the landmarks, `told`, if they are in doubt or elsewhere."""
@@ -210,19 +214,14 @@ class OnlinePipeline:
             found.put(lost[~near.doubtful], near[~near.doubtful])
         return found
 
-    def _told_px(self, kinematics: ArrayLike | Callable | None) -> np.ndarray | None:
+    def _told_px(self, paired: Callable[..., Correspondences]) -> np.ndarray | None:
         """(2, 3, 2) px where the rig in force has the landmarks that the robot reports; None if one is not known."""
-        if self.rig is None or kinematics is None:
+        if self.rig is None:
             return None
         n = len(LANDMARKS)
-        nowhere = np.full((2, n, 2), np.nan)
+        nothing = {"covariance_px2": np.full((n, 2, 2, 2), np.nan), "confidence": np.zeros((n, 2))}
         with suppress(ValueError, TypeError):  # no positions, of which the frame's failure will tell, or behind a camera
-            if callable(kinematics):
-                nothing = {"covariance_px2": np.full((1, n, 2, 2, 2), np.nan), "confidence": np.zeros((1, n, 2))}
-                rows = kinematics(*nowhere[:, None], linear=self.rig.linear, **nothing)
-            else:
-                rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(n))
-            x_mm = self._tracker.corrected(rows).x_mm
+            x_mm = self._tracker.corrected(paired(self.rig, np.full((2, n, 2), np.nan), **nothing)).x_mm
             return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
         return None
 

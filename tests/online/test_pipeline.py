@@ -12,7 +12,7 @@ from lib.calibration import calibrate
 from lib.calibration.offsets import tool_axes
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
-from lib.landmarks import SharedDetector
+from lib.landmarks import Landmarks, SharedDetector
 from lib.online import STAGES, Settings
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.moved_cameras import random_motion
@@ -230,6 +230,28 @@ def test_a_detector_that_takes_another_tool_looks_where_the_robot_says():
     assert [frame for frame, _ in asked] == list(range(20, 30))
     told = np.stack(world.rig.project(world.x_mm[29]))
     assert np.abs(asked[-1][1] - told).max() < 15 and np.abs(results[-1].landmarks.u_left - told[0]).max() < 6
+
+
+def test_where_the_robot_says_allows_for_the_landmarks_offsets():
+    """The detector marks the base 0.2 mm, 20 px, beside where the robot reports it, and loses the tool in the end."""
+    world, asked = World(2), []
+    told = world.x_mm.copy()
+    world.x_mm[:, 0] += np.einsum("nij,j->ni", tool_axes(world.x_mm), [0.2, 0.0, 0.0])
+
+    class Losing:
+        def __call__(self, images):
+            found = world.detect(images)
+            return Landmarks.none(2) if world.frame >= 30 else found
+
+        def near(self, images, u, *, ground):
+            asked.append(u)
+            return world.detect(images)
+
+    pipeline = make(world, detector=Losing(), settings=SELDOM)
+    for i in range(31):
+        world.advance()
+        pipeline.step(*world.images, told[i] + world.rng.normal(0, 0.01, (3, 3)))
+    assert np.abs(asked[-1] - np.stack(world.rig.project(world.x_mm[30]))).max() < 6
 
 
 def test_what_was_seen_becomes_the_ground_until_the_cameras_move():
