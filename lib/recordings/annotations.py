@@ -53,7 +53,7 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
     """
     try:
         content = json.loads(path.read_bytes())
-        categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
+        categories = {c["id"]: [str(name) for name in c["keypoints"]] for c in content["categories"] if "keypoints" in c}
         images = {image["id"]: str(image["file_name"]) for image in content["images"]}
         entries = [(a["image_id"], a["category_id"], a["keypoints"], {*a.get("absent", ())}) for a in content["annotations"]]
         found = [(images.get(image), categories.get(category)) for image, category, *_ in entries]

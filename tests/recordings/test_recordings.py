@@ -349,6 +349,11 @@ SPOILERS = {
         r"frames\.csv, line 4",
     ),
     "bad coco": (lambda f: (f / "annotations.json").write_text("{}"), ValueError, "not COCO keypoints"),
+    "a landmark's name is a list": (
+        lambda f: edit(f / "annotations.json", '["base"', '[["base"]'),
+        ValueError,
+        r"annotations\.json: image left/000000\.\w+ has keypoints .*; \['base', 'tip_1', 'tip_2'\] are needed",
+    ),
     "truth without rig": (lambda f: (f / "truth/rig.json").unlink(), FileNotFoundError, r"rig\.json"),
     "short truth": (
         lambda f: (f / "truth/landmarks.csv").write_text(
