@@ -259,9 +259,7 @@ def fit_surface(
         return problem, solution, BSplineSurface(grid, control_points)
 
     problem, solution, surface = solve(used, search if quick else exact)
-    residual = surface(u) - x
-    # With a camera only the depth is fitted, so only it can be wrong.
-    norm = np.abs(residual if camera is None else (residual @ axes.T) @ axes).sum(axis=1)
+    norm = np.abs((surface(u) - x) @ axes.T @ axes).sum(axis=1)  # with a camera only the depth can be wrong
     if reject_mm is None:
         # A surface as flexible as the points are few meets many of them exactly, and a median says nothing.
         reject_mm = max(REJECT_MEDIANS * float(np.median(norm[used])), float(np.partition(norm[used], least - 1)[least - 1]))
