@@ -229,7 +229,9 @@ class Recording:
     @cached_property
     def ground(self) -> Ground:
         """What the cameras see behind the tool; a detector in doubt looks at what differs from it."""
-        return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {self.frames.time_s.sum()}")
+        files = (path.stat() for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name)))
+        changed = [(file.st_size, file.st_mtime_ns) for file in files]  # an image exported again makes another ground
+        return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {changed}")
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.

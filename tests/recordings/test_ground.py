@@ -64,3 +64,6 @@ def test_recordings_have_one_each(tmp_path):
     assert one.ground().shape == (2, *one.frames[0].left.shape)
     assert one.ground is one.ground and len({one.ground.key, other.ground.key}) == 2
     assert Recording.open(one.folder).ground.key == one.ground.key
+    image = next((one.folder / "left").iterdir())
+    image.write_bytes(image.read_bytes())
+    assert Recording.open(one.folder).ground.key != one.ground.key  # detections by the old ground are not read again
