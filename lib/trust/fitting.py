@@ -12,6 +12,7 @@ from functools import cache, cached_property
 from typing import Self
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from lib.calibration import LandmarkOffsets
 from lib.calibration.affine import regress
@@ -248,9 +249,8 @@ class Problem:
             root = (np.sqrt(weight) / self.noise)[:, :, None]
             J = D * np.repeat(root, 2)[:, None]
             information = J.T @ J + prior
-            scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
-            information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
-            beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
+            np.fill_diagonal(information, np.diag(information) * (1.0 + 1e-10) + 1e-22)  # an unseen addition stays 0
+            beta = dposv(information, J.T @ (y * root).reshape(-1))[1]
             M, r = beta[:16].reshape(2, 2, 4), y - (D @ beta).reshape(y.shape)
             r2 = (r**2).sum(axis=2) / self.noise**2
             found = [Shape.of(r2[rows], least, old) for rows, (old, _) in zip(groups, found, strict=True)]
@@ -260,7 +260,7 @@ class Problem:
             before = total
         shapes, design = [shape for shape, _ in found], self._overcount(r * root)
         told = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # by so much this exceeds Fisher's information
-        inverse = np.linalg.inv(information) * np.outer(scale, scale) * design * told
+        inverse = np.linalg.inv(information) * design * told
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
         found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape), beta[16:25].reshape(3, 3), offset_sd
