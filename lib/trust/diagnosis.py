@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_opening, median_filter
 
 from lib.calibration import LandmarkOffsets
+from lib.calibration.timing import shift_misfits
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.parallel import single_threaded_blas
 from lib.recordings import Kinematics, Recording
@@ -28,6 +29,7 @@ _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAI
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
 _LEAST_LENGTH_MM = 1.0  # which no tool calibration errs by
+_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # of a tool that the robot may know nothing of
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
@@ -87,11 +89,17 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
 
 def _tool_length(case: Case) -> Iterator[Hypothesis]:
     """All landmarks beside where the robot reports them, alike: it reports another point of the tool."""
-    fit = case.problem.fit(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], case.problem.axes))
-    size_mm, sd_mm = float(np.linalg.norm(fit.theta)), float(np.sqrt(np.trace(fit.covariance)))
+    problem, along = case.problem, case.problem.axes[:, None, :, 0]
+    y = np.where(problem.used[:, :, None], problem.y, np.nan).reshape(-1, 4)
+    misfit = shift_misfits(problem.x[:, 0] + _LENGTHS_MM[:, None, None] * along[:, 0], y)
+    start_mm = _LENGTHS_MM[misfit.sum(axis=1).argmin()]
+    moved = replace(problem, x=problem.x + start_mm * along)
+    fit = moved.fit(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], problem.axes))
+    offset_mm = fit.theta + [start_mm, 0.0, 0.0]
+    size_mm, sd_mm = float(np.linalg.norm(offset_mm)), float(np.sqrt(np.trace(fit.covariance)))
     if size_mm - 2.0 * sd_mm > _LEAST_LENGTH_MM:
-        along = ", ".join(f"{v:.2f}" for v in fit.theta)
-        text = f"All landmarks lie {size_mm:.1f} mm from where the robot reports them ({along} mm in the tool's axes)."
+        each = ", ".join(f"{v:.2f}" for v in offset_mm)
+        text = f"All landmarks lie {size_mm:.1f} mm from where the robot reports them ({each} mm in the tool's axes)."
         cure = "Does the robot report its flange? Tell it the tool's length, or add it to all columns of kinematics.csv."
         yield case.found("landmark_offset", fit, 3, (1e3 * size_mm, 1e3 * sd_mm, "um"), text, cure)
 
@@ -152,10 +160,15 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     time = case.problem.time
     if not np.isfinite(time).all() or np.ptp(time) == 0:
         return
-    late = ((time - time.mean()) / np.ptp(time))[:, None, None, None, None, None] * case.problem.of_cameras
+    share = (time - time.mean()) / np.ptp(time)
+    late = share[:, None, None, None, None, None] * case.problem.of_cameras
     cure = "Fix the microscope and the robot, or calibrate shorter parts (--frames A:B)."
-    for columns, what in ((late[..., 3], "images creep"), (late, "cameras turn, zoom or move steadily: the images change")):
-        fit = case.linear(columns.reshape(len(time), 2, 2, -1))
+    for columns, what in (
+        (late[..., 3].reshape(len(time), 2, 2, -1), "images creep"),
+        (case.problem.of_motion(share), "cameras turn or move steadily together: the images change"),
+        (late.reshape(len(time), 2, 2, -1), "cameras turn, zoom or move steadily: the images change"),
+    ):
+        fit = case.linear(columns)
         moved_px = fit.moved_px[case.problem.used]
         size = float(np.sqrt(12.0 * (moved_px**2).sum(axis=1).mean()))  # the RMS of a line is 1/sqrt(12) of its range
         text = f"The {what} by {size:.1f} px from the first frame to the last."
@@ -213,16 +226,18 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         cure = f"Fix the tool in its holder, or calibrate before and after on their own ({parts}). "
         cure += "Where the tool does not turn, a robot whose zero changed looks the same."
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
-    for views in ((0, 1), (0,), (1,)):
-        fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
+    together = case.linear(problem.of_motion(late[:, 0]))
+    for views, fit in (((0, 1), both), ((0, 1), together), ((0,), None), ((1,), None)):
+        fit = fit or case.linear(problem.of_later_cameras(frame, views))
         rows = problem.used[:, views] & late
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
-        text = f"{who} moved or zoomed at about frame {number}: the images shift by {size:.1f} px."
+        how = "moved together" if fit is together else "moved or zoomed"
+        text = f"{who} {how} at about frame {number}: the images shift by {size:.1f} px."
         cure = f"Calibrate before and after on their own ({parts}). "
         cure += "lib.registration.register_images follows a move, and no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)
-        yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)
+        yield case.found("camera_moved", fit, fit.theta.size + 3, (size, 0.0, "px"), text, cure, images=views)
 
 
 def _frozen(case: Case) -> Iterator[Hypothesis]:
@@ -416,5 +431,5 @@ def diagnose(
         more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in after else h for h in more]
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
-    found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
+    found = _plainest(found + _unexplained(case, case.null if best is None else case.fits.get(best.name, fit)))
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

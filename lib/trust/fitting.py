@@ -176,6 +176,12 @@ class Problem:
         late = np.where((self.frame >= frame)[:, None, None, None, None, None], self.of_cameras[:, :, :, views], 0.0)
         return late.reshape(len(self), 2, 2, -1)
 
+    def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """`columns` of a turn about and a shift along x, y and z, by a `share` (n,) of them, of all landmarks together."""
+        turns, shifts = cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
+        moves = share[:, None, None, None] * np.concatenate([turns, shifts], axis=2)
+        return lambda M: np.einsum("cij,nckj->ncik", M[:, :, :3], moves)
+
     def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
         """The frame from which on cameras of their own suit the rows best, and the fit with them, from a `fit` without.
 

@@ -324,7 +324,7 @@ def assess(
         if best.name == "tool_slipped" and (moved_px > _MOVED_PX).all():
             diagnosis = Diagnosis(tuple(others))
         elif best.name == "camera_moved" and (best.value > _NEARER_PX + _TIMES * moved_px).all():
-            text = best.text.replace("Both cameras moved or zoomed", "Images and robot part")
+            text = "Images and robot part" + best.text[best.text.index(" at about frame") :]
             text += " What lies behind the tool stands still: the robot's report jumped."
             jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
             diagnosis = Diagnosis((jumped, *others))
