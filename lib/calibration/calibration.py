@@ -127,6 +127,13 @@ class Calibration:
         return self._rms(self.residuals_px[self.inliers])
 
     @property
+    def chi_square(self) -> tuple[float, int]:
+        """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
+        _, _, weight, r = self.system
+        value = float((r[:, None] @ weight @ r[:, :, None]).sum())
+        return value, 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
+
+    @property
     def inverse_distance_per_mm(self) -> tuple[float, float]:
         """1/d and its standard deviation (the first, where each camera has its own); (0, 0) for affine models."""
         for i, name in enumerate(self.parameter_names):
