@@ -393,10 +393,24 @@ def _backlash(size_mm: float) -> Callable[[Scene], None]:
     return _report(lambda scene, t, x: x + 0.5 * size_mm * np.sign(np.gradient(gaussian_filter1d(x, 4, axis=0), axis=0)))
 
 
-def _flange(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The robot reports points 12 mm behind: its tool has no length."""
-    along = x[:, 1:].mean(axis=1) - x[:, 0]
-    return x - 12.0 * (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
+def _flange(length_mm: float) -> Callable[[Scene], None]:
+    """The robot reports points that far behind: its tool has no length."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        along = x[:, 1:].mean(axis=1) - x[:, 0]
+        return x - length_mm * (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
+
+    return _report(edit)
+
+
+def _holding(seconds: float) -> Callable[[Scene], None]:
+    """The robot's log repeats each position for so long."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        every = round(seconds / np.median(np.diff(t)))
+        return x[np.arange(len(x)) // every * every]
+
+    return _report(edit)
 
 
 def _exchanged_later(scene: Scene, u: np.ndarray) -> np.ndarray:
@@ -605,7 +619,8 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("robot has backlash", "0.1 mm"): (("backlash",), _backlash(0.1)),
     ("eyes exchanged later", ""): (("exchanged_eyes",), _pixels(_exchanged_later)),
     ("clock", "3 s"): (("clock",), _set(offset_s=3.0)),
-    ("tool length not set", "12 mm"): (("landmark_offset",), _report(_flange)),
+    **{("tool length not set", f"{mm} mm"): (("landmark_offset",), _flange(mm)) for mm in (12, 25)},
+    ("log holds positions", "80 ms"): (("time_stamps", "frozen_kinematics"), _holding(0.08)),
 }  # fmt: skip
 
 #: Good recordings: sizes, rigs, noise levels, detectors.

@@ -45,6 +45,13 @@ def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
     assert best.name == "camera_moved" and "zoomed at about frame 20" in best.text and "no zoom" in best.cure
 
 
+def test_a_microscope_that_moves_as_a_whole_needs_six_numbers():
+    spoiled = take("camera moved", "0.3 degrees", seed=8)
+    first, second = [h for h in found(spoiled).hypotheses if h.name == "camera_moved" and len(h.images) == 2]
+    assert "moved together" in first.text and "moved or zoomed" in second.text
+    assert first.gain > second.gain + 20 and found(spoiled).best == first
+
+
 @pytest.mark.parametrize("name", ["setting", "judging"])
 def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
     (spike,) = takes(name, only="a spike")
@@ -67,7 +74,7 @@ def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
         ("left image sways", "4 px, each frame", 4.0 * np.sqrt(2)), ("microscope sways", "6 px, each frame", None),
         ("left lens breathes", "2 %", 1.4), ("robot has backlash", "0.1 mm", None),
         ("frames stamped apart", "20 ms", None), ("eyes exchanged later", "", None),
-        ("tool length not set", "12 mm", 12000.0),
+        ("tool length not set", "12 mm", 12000.0), ("tool length not set", "25 mm", 25000.0),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
