@@ -27,7 +27,7 @@ from lib.landmarks.network import Network
 #: ``"openvino"`` chooses the faster precision for the processor.
 ENGINES = ("torch", "cuda", "openvino", "openvino float32", "openvino bfloat16")
 _BATCH = 6  # images that are run at once
-_OFTEN, _ANY_SHAPE = 20, (-1, 3, -1, -1)  # a shape that is met more often is worth the time that compiling for it takes
+_OFTEN, _ANY_SHAPE = 300, (-1, 3, -1, -1)  # a shape that is met more often is worth the time that compiling for it takes
 _met: Counter = Counter()  # inputs of each network and shape
 _lock = threading.Lock()
 
