@@ -178,11 +178,13 @@ def _scaled_axis(
         text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
         # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
+        size, denied = (scale, sd * scale, "times"), refuted(axis, scale)
         if resized < least + _RATHER_RESIZED:
+            if denied:  # then they were
+                continue
             text += " They may as well be oblong because the images were resized, which cameras take on."
             explained = min(explained, _UNDECIDED)
-        size = scale, sd * scale, "times"
-        if refuted(axis, scale):
+        if denied:
             yield Hypothesis("odd_pixels", _ODD_PIXELS, _STEADY, *size, min(explained, _UNDECIDED), gain)
         else:
             yield Hypothesis("scaled_axis", text, _SCALE.format(name), *size, explained, gain)
