@@ -25,6 +25,18 @@ def agree(what: str, here: ArrayLike, library: ArrayLike, *, within: float, unit
     print(line)
 
 
+def in_range(**given: tuple[float, float, float]) -> None:
+    """Refuse a parameter out of range before anything is computed: name=(value, least, most), both of them allowed.
+
+    >>> in_range(share=(1.5, 0, 1))
+    Traceback (most recent call last):
+    ValueError: share = 1.5: give a value from 0 to 1.
+    """
+    for name, (value, least, most) in given.items():
+        if not least <= value <= most:  # a NaN fails too
+            raise ValueError(f"{name} = {value:g}: give a value from {least:g} to {most:g}.")
+
+
 def metrics_named(text: str) -> list[str]:
     """The metrics that a conclusion or its condition names, ``{name}`` or ``{name:.1f}``.
 
