@@ -22,6 +22,7 @@ from lib.trust import check
 from lib.workbench import pages, report, results
 from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
 from notebooks.figures import verdicts
+from notebooks.figures.course import in_range
 from tests.remembering import remembering_recordings
 
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
@@ -296,11 +297,29 @@ def test_what_judges_a_recording_is_said(small, tmp_path):
     assert "holds no surface" in verdicts.whether_true(bare)
 
 
-@pytest.mark.parametrize(("name", "share"), [("05_registration", "outliers"), ("08_the_robot_labels", "wrong")])
-def test_a_share_beyond_1_is_refused_before_anything_is_computed(name, share):
-    tree = ast.parse(code_cells(paths.NOTEBOOKS / f"{name}.ipynb")[1].source)
-    (guard,) = (node for node in tree.body if isinstance(node, ast.If) and share in ast.unparse(node.test))
-    code = compile(ast.Module([guard], []), name, "exec")
-    exec(code, {share: 1.0})
-    with pytest.raises(ValueError, match=rf"{share} = 1.5: give a share, 0 to 1\."):
-        exec(code, {share: 1.5})
+OUT_OF_RANGE = [
+    ("03", "n_rows", 6), ("03", "sigma_u_px", 0.0), ("03", "sigma_x_mm", 0.0), ("04", "frame", -1), ("04", "frame", 34),
+    ("05", "outliers", 1.5), ("05", "sigma_u_px", -1.0), ("05", "sigma_x_mm", float("nan")), ("06", "bump_after", 0.0),
+    ("06", "bump_after", 1.0), ("08", "wrong", 1.5), ("08", "sigma_px", 0.0), ("08", "minutes", 0.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("number", "name", "value"), OUT_OF_RANGE)
+def test_a_parameter_out_of_range_is_refused_in_one_line_that_names_it(number, name, value):
+    (path,) = (path for path in WALK if path.stem.startswith(number))
+    names = {"in_range": in_range, "source": range(34)}
+    exec(code_cells(path)[0].source, names)
+    for call in in_range_calls(path):
+        eval(call, names)  # the defaults are in range
+    names[name] = value
+    with pytest.raises(ValueError, match=rf"^{name} = {value:g}: give a value from \S+ to \S+\.$"):
+        [eval(call, names) for call in in_range_calls(path)]
+
+
+def in_range_calls(path):
+    """The calls of `in_range` in a notebook's first cells, compiled."""
+    for cell in code_cells(path)[:4]:
+        tree = ast.parse("\n".join(line for line in cell.source.splitlines() if not line.startswith("%")))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "in_range":
+                yield compile(ast.Expression(node), path.stem, "eval")
