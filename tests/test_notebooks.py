@@ -298,7 +298,8 @@ def test_what_judges_a_recording_is_said(small, tmp_path):
 
 
 OUT_OF_RANGE = [
-    ("03", "n_rows", 6), ("03", "sigma_u_px", 0.0), ("03", "sigma_x_mm", 0.0), ("04", "frame", -1), ("04", "frame", 34),
+    ("01", "real_frames", 0), ("02", "n_train", 8), ("02", "textures", 0), ("02", "every", 0), ("03", "n_rows", 6),
+    ("03", "sigma_u_px", 0.0), ("03", "sigma_x_mm", 0.0), ("04", "frame", -1), ("04", "frame", 34),
     ("05", "outliers", 1.5), ("05", "sigma_u_px", -1.0), ("05", "sigma_x_mm", float("nan")), ("06", "bump_after", 0.0),
     ("06", "bump_after", 1.0), ("08", "wrong", 1.5), ("08", "sigma_px", 0.0), ("08", "minutes", 0.0),
 ]  # fmt: skip
@@ -307,7 +308,7 @@ OUT_OF_RANGE = [
 @pytest.mark.parametrize(("number", "name", "value"), OUT_OF_RANGE)
 def test_a_parameter_out_of_range_is_refused_in_one_line_that_names_it(number, name, value):
     (path,) = (path for path in WALK if path.stem.startswith(number))
-    names = {"in_range": in_range, "source": range(34)}
+    names = {"in_range": in_range, "source": range(34), "TEXTURE_SEEDS": range(96)}
     exec(code_cells(path)[0].source, names)
     for call in in_range_calls(path):
         eval(call, names)  # the defaults are in range

@@ -137,14 +137,13 @@ def disc_page(p: np.ndarray, truth: np.ndarray, found: Mapping[str, np.ndarray],
 
 
 def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks; the first of a row has its title."""
-    columns = min(6, len(images))
-    rows = -(-len(images) // columns)
+    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks; a row for each title, which its first image has."""
+    rows, columns = len(titles), len(images) // len(titles)
     fig, axes = figure(rows, columns, width_in=10, height_in=1.8 * rows, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
-    for k, (ax, image, points, title) in enumerate(zip(axes.flat, images, u, titles, strict=False)):
-        show_image(ax, image, title if k % columns == 0 else "")
+    for k, (ax, image, points) in enumerate(zip(axes.flat, images, u, strict=True)):
+        show_image(ax, image, "" if k % columns else titles[k // columns])
         h, w = image.shape[:2]
         inside = ((points > -0.5) & (points < (w - 0.5, h - 0.5))).all(axis=1)
         landmark_dots(ax, np.where(inside[:, None], points, np.nan), size=40)
