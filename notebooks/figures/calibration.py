@@ -21,8 +21,6 @@ from notebooks.studies.camera_models import Comparison
 from notebooks.studies.dvrk import RobotFrames, SphereFit
 
 _WHITE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
-#: Colours of the depth uncertainty in `advice_view`.
-DEPTH_SCALE_UM = (30.0, 2000.0)
 
 
 def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
@@ -142,6 +140,7 @@ def ladder_table(comparison: Comparison, caption: str) -> HTML:
 def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
     """BIC above the best model's, a panel a data set."""
     page, axes = figure(1, len(comparisons), width_in=12, height_in=3.8, sharey=True, squeeze=False)
+    most = max(rung.bic - comparison.best.bic for comparison in comparisons.values() for rung in comparison.rungs)
     for ax, (title, comparison) in zip(axes[0], comparisons.items(), strict=True):
         names = [rung.model for rung in comparison.rungs]
         delta = [rung.bic - comparison.best.bic for rung in comparison.rungs]
@@ -155,31 +154,30 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
                 va="center",
                 fontsize=8,
             )
-        ax.set(xscale="log", xlim=(1, 4e4), xlabel="BIC above the best + 1", title=title)
+        ax.set(xscale="log", xlim=(1, 5 * (most + 1)), xlabel="BIC above the best + 1", title=title)
     axes[0, 0].invert_yaxis()  # shared
     return page
 
 
-def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 30.0) -> Figure:
+def ellipsoids(calibration: Calibration, x_mm: np.ndarray) -> Figure:
     """Uncertainty ellipsoids of triangulated points (n, 3), with and without the noise of their own detection, enlarged."""
     page, _ = figure(1, 2, width_in=12, height_in=4.6)
     page.clear()
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1)
-    panels = ((True, scale / 3, "Detection and calibration"), (False, scale, "Calibration alone"))
-    for i, (detection, factor, title) in enumerate(panels):
+    for i, (detection, title) in enumerate(((True, "Detection and calibration"), (False, "Calibration alone"))):
         axes = page.add_subplot(1, 2, i + 1, projection="3d")
-        sd = []
-        for x, covariance in zip(x_mm, calibration.point_covariance(x_mm, detection=detection), strict=True):
-            values, vectors = np.linalg.eigh(covariance)
-            surface = x + factor * (sphere * np.sqrt(values)) @ vectors.T
+        values, vectors = np.linalg.eigh(calibration.point_covariance(x_mm, detection=detection))
+        sd_mm = np.sqrt(values)
+        factor = float(f"{2.0 / sd_mm.max():.1g}")  # the longest half axis is drawn about 2 mm long
+        for x, sd, along in zip(x_mm, sd_mm, vectors, strict=True):
             axes.plot_surface(
-                *np.moveaxis(surface, -1, 0), color=COLOURS["ours" if detection else "paper"], alpha=0.7, linewidth=0
-            )
-            sd.append(1e3 * np.sqrt(values[-1]))
-        axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+                *np.moveaxis(x + factor * (sphere * sd) @ along.T, -1, 0),
+                color=COLOURS["ours" if detection else "paper"], alpha=0.7, linewidth=0,
+            )  # fmt: skip
         axes.set_title(
-            f"{title}: 1 sd enlarged {factor:.0f} times\nlongest half axis {min(sd):.0f} to {max(sd):.0f} um"
+            f"{title}: 1 sd enlarged {factor:g} times\n"
+            f"longest half axis {1e3 * sd_mm[:, -1].min():.0f} to {1e3 * sd_mm[:, -1].max():.0f} um"
         )
         axes.set_aspect("equal")
         axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
@@ -187,16 +185,19 @@ def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 30.
 
 
 def advice_view(
-    calibration: Calibration, robot_from_microscope: RigidTransform, half_size_mm: np.ndarray, advised_mm: np.ndarray
-) -> Figure:
-    """Depth sd from calibration over the focal plane, the correspondences used, and the advised position (3,)."""
+    calibration: Calibration, robot_from_microscope: RigidTransform, half_size_mm: np.ndarray, advised_mm: np.ndarray,
+    scale_um: tuple[float, float],
+) -> Figure:  # fmt: skip
+    """Depth sd from calibration over the focal plane, the correspondences used, and the advised position (3,).
+
+    All positions of a slider have one colour scale, from `scale_um[0]` to `scale_um[1]`, so that pictures can be compared.
+    """
     page, ax = figure(width_in=8.5, height_in=4.4)
     x, y = np.meshgrid(*(np.linspace(-h, h, 41) for h in half_size_mm[:2]))
     plane = robot_from_microscope.apply(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
     depth = 1e3 * calibration.depth_sd_mm(plane).reshape(x.shape)
     extent = (-half_size_mm[0], half_size_mm[0], -half_size_mm[1], half_size_mm[1])
-    # One colour scale for all positions of the slider, so that pictures can be compared.
-    norm = LogNorm(*DEPTH_SCALE_UM, clip=True)
+    norm = LogNorm(*scale_um, clip=True)
     image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis_r", norm=norm, aspect="equal")
     used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
     style = {"markeredgecolor": "black", "clip_on": False}
