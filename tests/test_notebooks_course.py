@@ -237,6 +237,7 @@ def test_a_difference_is_refused_and_a_claim_that_fails_says_so(monkeypatch):
     page = course.learnt(told).data
     assert page.splitlines()[0] == "- Wide: 3 um." and "**Not all of this holds in this run:** Small" in page
     assert "- One more conclusion is left out" in page
+    assert "Without a value in this run: c_um." in page and "no truth" in course.learnt({"{d_um}": "{d_um} > 0"}).data
     assert "2 more conclusions are left out" in course.learnt(told | {"{d_um}": "{d_um} > 0"}).data
 
 

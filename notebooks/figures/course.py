@@ -80,7 +80,11 @@ def learnt(claims: Mapping[str, str]) -> Markdown:
     if missing := len(claims) - len(told):
         more = " more" if told else ""
         rest = f"One{more} conclusion is" if missing == 1 else f"{missing}{more} conclusions are"
+        wanted = {name for text, condition in claims.items() for name in metrics_named(text + condition)}
+        void = [name for name in sorted(wanted) if report.RECORDED.get(name, 0.0) is None]
         why = "The recording may have no truth or no labels, or a real data set, Open3D or a recorded table may be missing."
+        if void:
+            why = f"Without a value in this run: {', '.join(void)}. What they measure did not happen, or had no data."
         lines.append(f"- {rest} left out: this run could not measure all the numbers. {why}")
     return Markdown("\n".join(lines))
 
