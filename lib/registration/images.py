@@ -89,35 +89,41 @@ def identify_motion(
         raise ValueError("covariance_px2: give the noise of the detections; it decides which hypothesis explains them.")
     together = _register_both(rig, observed, "robust")
     shifted = _fit(rig, observed, [RigidTransform.identity()], "robust", 3)
-    alone = []  # each camera's own motion, and its parameters: an affine camera sees no shift along its own axis
+    stay, rigs, bic = RigidTransform.identity(), {}, {}
+    apart, alone, parameters = [], [], []  # an affine camera sees no shift along its own axis
     for side, (name, camera) in enumerate((("left", rig.left), ("right", rig.right))):
         check_spread(observed.x[observed.seen[:, side]], f"x_mm (rows seen by the {name} camera)")
-        own = replace(observed, seen=observed.seen & (np.arange(2) == side))
-        parameters = 6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5
-        squared = _fit(rig, own, [RigidTransform.identity()], "squared", parameters)
-        alone.append((_fit(rig, own, [squared.transform], "robust", parameters), parameters))
-    (left, n_left), (right, n_right) = alone
+        image = replace(observed, seen=observed.seen & (np.arange(2) == side))
+        parameters.append(6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5)
+        squared = _fit(rig, image, [stay], "squared", parameters[side])
+        apart.append(_fit(rig, image, [squared.transform], "robust", parameters[side]))
+        both = replace(observed, moves=(side == 0, side == 1))  # of a camera that stayed the image shows the robot's errors
+        alone.append(_fit(rig, both, [apart[side].transform], "robust", parameters[side]))
     hypotheses = {
         "none": (None, None, 0), "shifted": (shifted, shifted, 3), "together": (together, together, 6),
-        "left": (left, None, n_left), "right": (None, right, n_right), "apart": (left, right, n_left + n_right),
+        "left": (alone[0], None, parameters[0]), "right": (None, alone[1], parameters[1]),
+        "apart": (*apart, sum(parameters)),
     }  # fmt: skip
-    stay, rigs, bic = RigidTransform.identity(), {}, {}
-    for name, (*motions, parameters) in hypotheses.items():
+    for name, (*motions, free) in hypotheses.items():
         rigs[name] = rig.moved(*(stay if motion is None else motion.transform for motion in motions))
-        bic[name] = 2 * _evaluate(rigs[name], observed, "robust", stay)[0] + parameters * np.log(2 * observed.seen.sum())
+        bic[name] = 2 * _evaluate(rigs[name], observed, "robust", stay)[0] + free * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
 
 
 @dataclass(frozen=True)
 class _Observed:
-    """What the images show while the robot reports: x (n, 3) mm, y (n, 4) px, which of the two images count (n, 2)."""
+    """What the images show while the robot reports: x (n, 3) mm, y (n, 4) px, which of the two images count (n, 2).
+
+    `moves`: whether the left and the right camera have the motion that is sought.
+    """
 
     x: np.ndarray
     y: np.ndarray
     covariance: np.ndarray
     seen: np.ndarray
     scale_known: bool
+    moves: tuple[bool, bool] = (True, True)
 
     @classmethod
     def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> Self:
@@ -169,7 +175,8 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
 def _evaluate(rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform) -> tuple[float, tuple[np.ndarray, ...]]:
     """Negative log likelihood but for a constant; residuals (n, 4), chi-squares (n,) and weights (n,) of the rows."""
     try:
-        residual = data.y - np.hstack(rig.project(stale.apply(data.x)))
+        moved, pair = stale.apply(data.x), zip((rig.left, rig.right), data.moves, strict=True)
+        residual = data.y - np.hstack([camera.project(moved if moves else data.x) for camera, moves in pair])
     except ValueError:  # the landmarks would lie behind a near-affine camera
         return np.inf, ()
     distance2 = np.einsum("ni,nij,nj->n", residual, data.information, residual)
@@ -204,7 +211,7 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     def gradients(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Of each row: information (n, 6, 6) and gradient (n, 6)."""
         x, (residual, _, weights) = stale.apply(data.x), work
-        J = rig.jacobian(x) @ (motion_jacobian(x - centre) * free)
+        J = rig.jacobian(x) @ (motion_jacobian(x - centre) * free) * np.repeat(data.moves, 2)[:, None]
         JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
         return JtW @ J, np.einsum("nij,nj->ni", JtW, residual)
 

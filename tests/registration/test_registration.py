@@ -321,6 +321,21 @@ def test_the_camera_that_moved_is_named(moved):
     assert grid_error_mm(found.rig, RIG.moved(*pair)) < 0.15
 
 
+@pytest.mark.parametrize("moved", ["left", "right"])
+def test_the_image_of_the_camera_that_stayed_shows_the_robots_errors(moved):
+    """A detector ten times as exact as the robot: the other camera has not moved as well."""
+    stay, errors_mm = RigidTransform.identity(), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        motion = random_motion(rng, centre_mm=CENTRE_MM, rotation_rad=0.02, translation_mm=0.05)
+        rig = RIG.moved(*((motion, stay) if moved == "left" else (stay, motion)))
+        data = tool_frames(10, rng=rng, rig=rig, sigma_u_px=0.1, sigma_x_mm=SIGMA_MM)
+        found = identify_motion(RIG, data, covariance_px2=0.01, sigma_x_mm=SIGMA_MM)
+        assert found.moved == moved
+        errors_mm.append(grid_error_mm(found.rig, rig))
+    assert np.median(errors_mm) < 0.012
+
+
 # --- near-affine cameras -----------------------------------------------------------------------------------------------
 
 NEAR = reference_rig(inverse_distance_per_mm=1 / 150.0)
