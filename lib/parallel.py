@@ -81,7 +81,8 @@ def single_threaded_torch() -> Iterator[None]:
 def single_threaded_blas() -> Iterator[None]:
     """Run the block, or the function that this decorates, with one thread of numpy's and scipy's linear algebra.
 
-    For many small matrices more threads gain nothing, and where cores are busy they wait for each other.
+    For many small matrices more threads gain nothing, and where cores are busy they wait for each other.  The limit is the
+    process's: blocks of several threads that overlap may leave it set.
     """
     with _loaded_libraries().limit(limits=1, user_api="blas"):
         yield

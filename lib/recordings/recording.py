@@ -229,8 +229,8 @@ class Recording:
     @cached_property
     def ground(self) -> Ground:
         """What the cameras see behind the tool; a detector in doubt looks at what differs from it."""
-        files = (path.stat() for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name)))
-        changed = [(file.st_size, file.st_mtime_ns) for file in files]  # an image exported again makes another ground
+        files = [path for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name))]
+        changed = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.is_file()]  # exported anew
         return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {changed}")
 
     def landmarks_mm(self) -> np.ndarray:

@@ -29,7 +29,7 @@ _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAI
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
 _LEAST_LENGTH_MM = 1.0  # which no tool calibration errs by
-_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # of a tool that the robot may know nothing of
+_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # which the robot's report may lack
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
@@ -80,7 +80,7 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     if size - 2.0 * sd > _LEAST_OFFSET_UM:
         far = [k for k in np.argsort(-sizes) if sizes[k] > 2e3 * free.offset_sd[k]]
         each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in free.offsets[k])})" for k in far]
-        text = f"The images show beside the robot's report, in the tool's axes: {'; '.join(each)}."
+        text = f"The images show landmarks beside the robot's report, in the tool's axes: {'; '.join(each)}."
         cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
         certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # cameras with offsets have no residuals of them
@@ -89,13 +89,16 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
 
 def _tool_length(case: Case) -> Iterator[Hypothesis]:
     """All landmarks beside where the robot reports them, alike: it reports another point of the tool."""
-    problem, along = case.problem, case.problem.axes[:, None, :, 0]
+    problem, fits = case.problem, []
     y = np.where(problem.used[:, :, None], problem.y, np.nan).reshape(-1, 4)
-    misfit = shift_misfits(problem.x[:, 0] + _LENGTHS_MM[:, None, None] * along[:, 0], y)
-    start_mm = _LENGTHS_MM[misfit.sum(axis=1).argmin()]
-    moved = replace(problem, x=problem.x + start_mm * along)
-    fit = moved.fit(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], problem.axes))
-    offset_mm = fit.theta + [start_mm, 0.0, 0.0]
+    for axes in (problem.axes, case.smooth_axes()):
+        along = axes[:, None, :, 0]
+        misfit = shift_misfits(problem.x[:, 0] + _LENGTHS_MM[:, None, None] * along[:, 0], y)
+        start_mm = _LENGTHS_MM[misfit.sum(axis=1).argmin()]
+        moved = replace(problem, x=problem.x + start_mm * along)
+        fit = moved.fit(lambda M, axes=axes: np.einsum("cij,njk->ncik", M[:, :, :3], axes))
+        fits.append((fit.total, fit, fit.theta + [start_mm, 0.0, 0.0]))
+    _, fit, offset_mm = max(fits, key=lambda one: one[0])
     size_mm, sd_mm = float(np.linalg.norm(offset_mm)), float(np.sqrt(np.trace(fit.covariance)))
     if size_mm - 2.0 * sd_mm > _LEAST_LENGTH_MM:
         each = ", ".join(f"{v:.2f}" for v in offset_mm)
@@ -431,5 +434,6 @@ def diagnose(
         more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in after else h for h in more]
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
-    found = _plainest(found + _unexplained(case, case.null if best is None else case.fits.get(best.name, fit)))
+    left = _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
+    found = found + left if any(h.explained > _MOSTLY for h in left) else _plainest(found + left)
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

@@ -16,7 +16,7 @@ from scipy.linalg.lapack import dposv
 
 from lib.calibration import LandmarkOffsets
 from lib.calibration.affine import regress
-from lib.calibration.offsets import rows_axes
+from lib.calibration.offsets import rows_axes, tool_axes
 from lib.calibration.robust import tightest_sample
 from lib.calibration.timing import Paths
 from lib.correspondences import Correspondences
@@ -350,6 +350,14 @@ class Case:
     def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
         """(n, 3) mm/s of the rows, `shift_s` later."""
         return self.paths.at(self.problem.landmark, self.problem.time + self._clock_s + shift_s, 1)
+
+    def smooth_axes(self) -> np.ndarray:
+        """(n, 3, 3) of the tool by its path, at each row's own instant: a long lever moves far in a few ms, and by noise."""
+        axes, now = self.problem.axes, self.problem.time + self._clock_s
+        if self.paths is None or len(self.paths.pieces) < 3:
+            return axes
+        own = tool_axes(np.stack([self.paths.at(np.full(len(now), k), now) for k in range(3)], axis=1))
+        return np.where(np.isfinite(own), own, axes)
 
     def by_frame(self, values: np.ndarray) -> np.ndarray:
         """Values (n, ...) of the rows as (frames, 3, ...), NaN where a landmark is missing."""

@@ -315,7 +315,7 @@ def assess(
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
-    near |= calibration is None and fit is calibrate_as_shown  # which asks whether a distance shows
+    near |= calibration is None and fit is calibrate_as_shown  # which finds a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
     if (best := diagnosis.best) is not None and best.name in ("camera_moved", "tool_slipped") and len(best.images) == 2:
         pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
