@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 
 #: A scheduler must answer within these seconds.
 ANSWER_S = 15.0
+_loaded_libraries = cache(ThreadpoolController)
 
 
 def run_jobs(
@@ -86,11 +87,6 @@ def single_threaded_blas() -> Iterator[None]:
     """
     with _loaded_libraries().limit(limits=1, user_api="blas"):
         yield
-
-
-@cache
-def _loaded_libraries() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _work(function: Callable, path: Path, *arguments: object) -> None:

@@ -228,9 +228,9 @@ class Recording:
 
     @cached_property
     def ground(self) -> Ground:
-        """What the cameras see behind the tool; a detector in doubt looks at what differs from it."""
+        """What the cameras see behind the tool, by the images' dates; a detector in doubt looks at what differs from it."""
         files = [path for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name))]
-        changed = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.is_file()]  # exported anew
+        changed = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.is_file()]
         return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {changed}")
 
     def landmarks_mm(self) -> np.ndarray:

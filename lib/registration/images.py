@@ -90,14 +90,15 @@ def identify_motion(
     together = _register_both(rig, observed, "robust")
     shifted = _fit(rig, observed, [RigidTransform.identity()], "robust", 3)
     stay, rigs, bic = RigidTransform.identity(), {}, {}
-    apart, alone, parameters = [], [], []  # an affine camera sees no shift along its own axis
+    apart, alone, parameters = [], [], []  # of the left and of the right camera
     for side, (name, camera) in enumerate((("left", rig.left), ("right", rig.right))):
         check_spread(observed.x[observed.seen[:, side]], f"x_mm (rows seen by the {name} camera)")
         image = replace(observed, seen=observed.seen & (np.arange(2) == side))
-        parameters.append(6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5)
+        parameters.append(6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5)  # affine: no shift along its axis
         squared = _fit(rig, image, [stay], "squared", parameters[side])
         apart.append(_fit(rig, image, [squared.transform], "robust", parameters[side]))
-        both = replace(observed, moves=(side == 0, side == 1))  # of a camera that stayed the image shows the robot's errors
+        # If the other camera stayed, its image shows the robot's errors, which both images share.
+        both = replace(observed, moves=(side == 0, side == 1))
         alone.append(_fit(rig, both, [apart[side].transform], "robust", parameters[side]))
     hypotheses = {
         "none": (None, None, 0), "shifted": (shifted, shifted, 3), "together": (together, together, 6),

@@ -29,7 +29,7 @@ _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAI
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
 _LEAST_LENGTH_MM = 1.0  # which no tool calibration errs by
-_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # which the robot's report may lack
+_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # of the tool, that the robot's report may lack
 _AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
@@ -435,5 +435,6 @@ def diagnose(
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     left = _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
+    # A cause that leaves most landmarks far off is no likelier than what it leaves.
     found = found + left if any(h.explained > _MOSTLY for h in left) else _plainest(found + left)
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

@@ -26,7 +26,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
-HOPELESS = 20.0  # log likelihood that the samples of a fit lack which never beats "nothing is wrong"
+HOPELESS = 20.0  # a fit whose samples are so much less likely (log) than "nothing is wrong" never beats it
 _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a robot for eye surgery errs by less, and by less than so often what is stated
@@ -352,7 +352,7 @@ class Case:
         return self.paths.at(self.problem.landmark, self.problem.time + self._clock_s + shift_s, 1)
 
     def smooth_axes(self) -> np.ndarray:
-        """(n, 3, 3) of the tool by its path, at each row's own instant: a long lever moves far in a few ms, and by noise."""
+        """The tool's axes (n, 3, 3) by its smoothed path, at each row's instant: noise and some ms turn a long lever far."""
         axes, now = self.problem.axes, self.problem.time + self._clock_s
         if self.paths is None or len(self.paths.pieces) < 3:
             return axes

@@ -180,7 +180,7 @@ def _scaled_axis(
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
         size, denied = (scale, sd * scale, "times"), refuted(axis, scale)
         if resized < least + _RATHER_RESIZED:
-            if denied:  # then they were
+            if denied:  # then the images were resized, which does no harm
                 continue
             text += " They may as well be oblong because the images were resized, which cameras take on."
             explained = min(explained, _UNDECIDED)
