@@ -63,7 +63,7 @@ def sweep(
     Args:
         grid: Values as texts for each parameter; none takes the grid that the notebook declares.
         workers, scheduler: As in `lib.parallel.run_jobs`.
-        record: Also write the table to the folder `recorded`, if no run failed.
+        record: Also write the table to the folder `recorded`, if no run failed and each stated a number.
 
     Returns ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
     """
@@ -83,6 +83,8 @@ def sweep(
     of_file = {folder / f"{digest}.ipynb": point for digest, point in zip(digests, points, strict=True)}
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
+    for executed in [executed for executed, row in rows.items() if row == of_file[executed]]:
+        executed.unlink()  # it stated no number; what it lacked may be at hand now
     failures: dict[str, str] = {}
     table = folder / "results.csv"
     for executed, error in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
@@ -97,6 +99,8 @@ def sweep(
     in_order = [rows[path] for path in of_file if path in rows]
     files.write_text(table, results.csv_text(in_order))
     save_plots(in_order, list(grid), folder)
+    blank = {_label(point): "it stated no number, so nothing is recorded" for point in of_file.values() if point in in_order}
+    failures |= blank if record else {}
     if record and not failures:
         results.write(book.stem, in_order, provenance.so_far() | _cost(rows), recorded)
     return table, failures

@@ -81,6 +81,28 @@ def test_a_sweep_makes_a_table_and_goes_on(write_notebook, tmp_path, scheduler, 
     assert sweep("luck", **places) == (table, {})
 
 
+def test_a_run_without_a_number_is_no_record_and_runs_again(write_notebook, tmp_path, scheduler, monkeypatch):
+    """The data of a study may be at hand the next time."""
+    data = tmp_path / "data"
+    study = f"from pathlib import Path\nfrom lib.workbench import report\nif Path({str(data)!r}).exists():\n"
+    study += '    report.record("depth_error", 1, "um", note="")'
+    book = write_notebook(tmp_path, "absent", study, parameters="seed: int = 0  # of the noise; grid: 0, 1")
+    places = {"scheduler": scheduler, "runs": tmp_path / "runs", "notebooks": tmp_path, "recorded": tmp_path / "recorded"}
+    table, failures = sweep(str(book), **places)
+    assert not failures and read(table) == [{"seed": "0"}, {"seed": "1"}]
+    data.touch()
+    kept = {file: file.stat().st_mtime_ns for file in table.parent.glob("*.ipynb")}
+    table, failures = sweep(str(book), record=True, **places)
+    assert not failures and [row["depth_error_um"] for row in read(table)] == ["1", "1"]
+    assert all(file.stat().st_mtime_ns != time_ns for file, time_ns in kept.items())
+    data.unlink()
+    (table.parent / min(file.name for file in kept)).unlink()
+    before = (tmp_path / "recorded" / "absent.csv").read_bytes()
+    _, failures = sweep(str(book), record=True, **places)
+    (why,) = failures.values()
+    assert "stated no number" in why and (tmp_path / "recorded" / "absent.csv").read_bytes() == before
+
+
 def test_the_digest_changes_with_notebook_and_code(write_notebook, tmp_path, monkeypatch):
     monkeypatch.setattr(paths, "ROOT", tmp_path)
     (tmp_path / "lib").mkdir()
