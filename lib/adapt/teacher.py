@@ -206,8 +206,9 @@ def teach(
         far = (sure_mm > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM)) & (not (alone or clicked))
         confidence = used.confidence[:, :, 0]
         other_base |= bool(far[0] and np.median(confidence[confidence >= MIN_CONFIDENCE]) < _KNOWN)
-        if far[1:].any() or (far[0] and not other_base):
-            k = int(sure_mm.argmax())
+        far[0] &= not other_base
+        if far.any():
+            k = int((far * sure_mm).argmax())
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool "
@@ -260,8 +261,8 @@ def _own_bias(seen: Seen) -> np.ndarray:
     """Standard deviations (3, 3) of a detector's own constant errors, as `_OWN_BIAS`, from how sure it is of the base."""
     along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
     stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
-    own = _OWN_BIAS.copy()
-    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
+    own, stated = _OWN_BIAS.copy(), stated[np.isfinite(stated)]
+    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.median(stated)) if stated.size else own[0, 0]
     return own
 
 
@@ -419,7 +420,9 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    if by_hand or calibration.reprojection_rms_px < _HARMLESS * np.nanmedian(tool_length_px(seen.u)):
+    length_px = tool_length_px(seen.u)
+    shown_px = length_px[np.isfinite(length_px)]
+    if by_hand or (shown_px.size and calibration.reprojection_rms_px < _HARMLESS * np.median(shown_px)):
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
