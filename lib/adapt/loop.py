@@ -38,11 +38,6 @@ _UNSMOOTHED = (
     "The robot's log was not smoothed: it is short, repeats samples, is too slow for the motion, or is noisier than the "
     "{:.2g} um of robot_accuracy_mm in recording.toml. Log faster, or correct that number."
 )
-#: Said of a detector that sees the base elsewhere than the robot, and is not sure of it.
-_OTHER_BASE = (
-    "The detector takes another point of this tool for its base, so the base is taught as the robot reports it, within the "
-    "robot's usual 0.15 mm. If the robot's tool has other dimensions, that is wrong: look at the pictures, or give --labels."
-)
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -295,8 +290,6 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         self.report["refused_frames"] = teacher.refused
-        if teacher.other_base:
-            self.report["notes"].append(_OTHER_BASE)
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
         some = learn[:: max(1, len(learn) // 8)]

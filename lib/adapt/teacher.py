@@ -64,7 +64,6 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _POOR = (DataError, np.linalg.LinAlgError)  # what data end in that tell too little; other errors are of the program
 _OTHER_POINT = 0.3  # from a detector's point to the labelled one, standard deviation, as a share of the tool's length
-_KNOWN = 0.8  # median confidence of the base above which the detector knows the tool
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -111,7 +110,6 @@ class Teacher:
     refused: np.ndarray  # frames in which the robot is not believed
     right: float  # share of the landmarks that agree on the cameras
     turns: bool = False  # as `LandmarkOffsets.turns`
-    other_base: bool = False  # whether the detector takes another point of the tool for its base
 
     def project(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
@@ -182,8 +180,8 @@ def teach(
 
     Raises:
         RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
-            a tip, or a base of which the detector is sure, is seen more than 15 % of the tool's length and 0.25 mm off, the
-            place of a landmark stays open by more than 10 %, or the robot contradicts the images.
+            a landmark is seen more than 15 % of the tool's length and 0.25 mm off, its place stays open by more than 10 %, or
+            the robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
     refused = _frozen(recording, seen.frame)
@@ -195,20 +193,16 @@ def teach(
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
-    told, turns, other_base = calibration.offsets, False, before is not None and before.other_base
+    told, turns = calibration.offsets, False
     offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:
-        told = _opinion(recording, opinion, used.frame, other_base)
+        told = _opinion(recording, opinion, used.frame)
     if told is not None and told.offset.shape == (3, 3):
         length = _length_mm(recording)
         size_mm = np.linalg.norm(told.offset, axis=1)
         sure_mm = size_mm - 2 * np.linalg.norm(told.standard_deviation * told.offset, axis=1) / np.maximum(size_mm, 1e-9)
-        far = (sure_mm > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM)) & (not (alone or clicked))
-        confidence = used.confidence[:, :, 0]
-        other_base |= bool(far[0] and np.median(confidence[confidence >= MIN_CONFIDENCE]) < _KNOWN)
-        far[0] &= not other_base
-        if far.any():
-            k = int((far * sure_mm).argmax())
+        if sure_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
+            k = int(sure_mm.argmax())
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool "
@@ -218,12 +212,10 @@ def teach(
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector takes other points for the tips. {_LABEL}")
         turns = told.turns
         own = 0.2 * _OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
-        own[0] = _OTHER_POINT if other_base and not (alone or clicked) else own[0]
-        least_mm = np.where(own == _OTHER_POINT, _ROBOTS_OFFSET_MM, 0.0)
-        offset, covariance = _robots_share(told, own * length, least_mm)
+        offset, covariance = _robots_share(told, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
-    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns, other_base)
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
     if clicked:
         teacher = _as_labelled(teacher, clicks)
     u, covariance = teacher.project(np.unique(np.linspace(0, len(recording) - 1, 200).astype(int)))
@@ -240,13 +232,10 @@ def teach(
     return replace(teacher, refused=np.union1d(refused, against))
 
 
-def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray, other_base: bool) -> LandmarkOffsets | None:
-    """The offsets that later stages see; a `RefusalError` where they hardly see a landmark near where the robot says.
-
-    They see the base elsewhere if the detector takes another point for it.
-    """
+def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> LandmarkOffsets | None:
+    """The offsets that later stages see; a `RefusalError` where they hardly see a landmark near where the robot says."""
     shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
-    if shares[other_base:].min() < LEAST_RIGHT * shares.max():
+    if shares.min() < LEAST_RIGHT * shares.max():
         rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
         raise RefusalError(
             f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
@@ -261,8 +250,8 @@ def _own_bias(seen: Seen) -> np.ndarray:
     """Standard deviations (3, 3) of a detector's own constant errors, as `_OWN_BIAS`, from how sure it is of the base."""
     along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
     stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
-    own, stated = _OWN_BIAS.copy(), stated[np.isfinite(stated)]
-    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.median(stated)) if stated.size else own[0, 0]
+    own = _OWN_BIAS.copy()
+    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
     return own
 
 
@@ -420,9 +409,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    length_px = tool_length_px(seen.u)
-    shown_px = length_px[np.isfinite(length_px)]
-    if by_hand or (shown_px.size and calibration.reprojection_rms_px < _HARMLESS * np.median(shown_px)):
+    if by_hand or calibration.reprojection_rms_px < _HARMLESS * np.nanmedian(tool_length_px(seen.u)):
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
@@ -430,15 +417,15 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 
 
-def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray, least_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The part of the offsets (3, 3) that is the robot's, and its covariance (3, 3, 3); the rest is the detector's own.
 
     Both have Gaussian priors: the detector's of `own_sd` (3, 3) mm, the robot's of the width that makes the nine numbers most
-    probable, `least_mm` (3, 3) at least.  Offsets no larger than a detector's usual ones are taken for the detector's.
+    probable.  Offsets no larger than a detector's usual ones are taken for the detector's.
     """
     widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
     total = widths**2 + own_sd**2 + found.standard_deviation**2
-    width = np.maximum(widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0], least_mm)
+    width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
     return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)[:, :, None] ** 2 * np.eye(3)

@@ -143,7 +143,7 @@ class Recorder:
                     spent.writerow([cells["frame"], *seconds])
                     times.writerow([self._count, float(arrival.time_s)])
                     self._count += 1
-        except OSError as error:
+        except Exception as error:  # told by `failure`; whoever adds frames must not wait for a thread that has ended
             self.failure = f"{self.folder}: the recording ended after {self._count} frames ({error})."
             while self._queue.get() is not None:  # nobody waits for a place
                 pass

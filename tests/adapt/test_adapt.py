@@ -220,26 +220,6 @@ class LaterStages(StandIn):
         return self(images)
 
 
-@pytest.mark.parametrize("confidence", [0.9, 0.6])
-def test_a_detector_that_is_unsure_of_the_base_believes_the_robot(world, off_by_a_fifth, confidence):
-    """An unknown tool: the detector takes the elbow of its jaws for the base.  One that is sure of it knows the tool."""
-    frames, elbows = np.arange(world.n), world.u.copy()
-    elbows[:, :, 0] += 0.25 * (elbows[:, :, 1:].mean(axis=2) - elbows[:, :, 0])
-    seen = look(off_by_a_fifth, StandIn(elbows, noise_px=0.7, wrong=0.2), frames)
-    seen.confidence[:, :, 0] = np.minimum(seen.confidence[:, :, 0], confidence)
-    if confidence > 0.8:
-        with pytest.raises(RefusalError, match="sees base.*another point.*Label 10 pairs"):
-            teach(off_by_a_fifth, seen)
-        return
-    teacher = teach(off_by_a_fifth, seen)
-    later = look(off_by_a_fifth, LaterStages(elbows, noise_px=0.7), frames, near=teacher.labels(frames)[0])
-    assert (later.confidence[:, :, 0] == 0).mean() > 0.9  # near where the robot says there is no elbow
-    for one in (teacher, teach(off_by_a_fifth, later, opinion=later, before=teacher)):
-        error, relative = label_errors(world, one)
-        assert one.other_base and np.nanmedian(error[..., 0]) < 5.5 and np.nanmedian(error[..., 1:]) < 1.0  # 0.2 mm are 5 px
-        assert np.sqrt(np.nanmean(relative**2)) < 1.5
-
-
 def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
     """In two thirds of the images the detector takes the elbow of a jaw for its tip: the others tell the offsets."""
     frames, elbows = np.arange(world.n), world.u.copy()
