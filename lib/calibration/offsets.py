@@ -212,7 +212,7 @@ def _steps(
     p_value, views = np.nan, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
-    step, share, before_px = np.zeros(offset.size), 1.0, np.inf
+    step, share, before_px, before_inliers = np.zeros(offset.size), 1.0, np.inf, None
 
     for i in range(iterations):
         own = axes(offset) if callable(axes) else np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes
@@ -221,8 +221,9 @@ def _steps(
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
         found = fit(*((x, y - shift) if axes is None else (x + shift, y)), views=views)
         # Outliers that come and go from step to step would be no end; where other axes of rows were chosen they are new.
-        views = found.view_inliers if i >= taken + 2 and found.reprojection_rms_px < 1.2 * before_px else None
-        before_px = found.reprojection_rms_px
+        settled = i >= taken + 2 or (i > taken and np.array_equal(found.view_inliers, before_inliers))
+        views = found.view_inliers if settled and found.reprojection_rms_px < 1.2 * before_px else None
+        before_px, before_inliers = found.reprojection_rms_px, found.view_inliers
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         J = _by_offset(axes, offset, landmark, own)[rows]
