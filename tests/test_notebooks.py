@@ -109,6 +109,7 @@ def test_the_grid_fits_the_parameters(path):
     for name, values in declared_grid(path).items():
         assert values, name
         for value in values:
+            assert value[0] not in "\"'", f"{name}: a text in a grid stands without quotes: {value}"
             parse_parameters([(name, value)], [path])
     table = results.read(path.stem)
     if table is not None:

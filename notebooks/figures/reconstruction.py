@@ -24,6 +24,8 @@ from lib.matching.deepmatching import correlation_maps, unit_patches, unit_windo
 from lib.matching.descriptors import PATCH
 from lib.surface import BSplineSurface, Mesh, ToolDistance
 from lib.workbench.results import Table
+from notebooks.figures.detector_records import recorded as when
+from notebooks.figures.detector_records import weights
 from notebooks.figures.interactive import explore
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image, table
 from notebooks.studies.matching_evaluation import DisparityScore
@@ -509,7 +511,7 @@ def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
         columns |= {"sphere_rms_um": "sphere"}
         rows = [[e["scene"], *numbers(e.get(key, np.nan) for key in columns)] for e in recorded["surfaces"].rows]
         header = ["scene, true cameras", *(f"{name}, RMS (um)" for name in columns.values())]
-        tables.append(table(header, rows, f"{caption} True cameras.").data)
+        tables.append(table(header, rows, f"{when(recorded['surfaces'])}: {caption} True cameras.").data)
     rows = []
     calibrated = recorded.get("calibrated_surfaces")
     for name in ("true", "plain", "plain_refined", "recommended", "recommended_refined") if calibrated else ():
@@ -520,7 +522,8 @@ def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
                 rows.append([f"{setting}: {name.replace('_', ', ')} cameras", *numbers(rms)])
     if rows:
         header = ["75 frames", "RMS (um)", "rigid motion taken out", "affine map taken out"]
-        tables.append(table(header, rows, f"{caption} Cameras calibrated from 75 detected frames.").data)
+        made = f"{when(calibrated)} {weights(calibrated)}"
+        tables.append(table(header, rows, f"{made}: {caption} Cameras calibrated from 75 detected frames.").data)
     return HTML("".join(tables))
 
 
@@ -529,6 +532,7 @@ def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
 
     CPU seconds hold on a busy machine, wall seconds on an idle one.
     """
+    names = ("l1_solver", "reconstruction_speed", "matching")
     rows = [
         [
             f"Eq. 6, {e['control']:.0f} x {e['control']:.0f}, n = {e['n_points']:.0f}",
@@ -560,7 +564,8 @@ def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
         for e in (recorded["matching"].rows if "matching" in recorded else ())
         if e["width_px"] and np.isfinite(e.get("all_median_px", np.nan))
     ]
-    return table(["measured", "CPU (s)", "wall (s)", "error", "details"], rows, caption)
+    dates = ", ".join(f"{name} {recorded[name].provenance['date']}" for name in names if name in recorded)
+    return table(["measured", "CPU (s)", "wall (s)", "error", "details"], rows, f"{caption} ({dates or 'no record'})")
 
 
 def tool_over_surface(
