@@ -21,7 +21,8 @@ _FRAMES = 20_000  # between false alarms, at least
 _LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 1.0, 1.0, 0.1, 0.03, 0.03)
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = (4, 4, 4, 4, 10, 10, 10)  # frames over which correlated noise counts: about as many as an alarm takes
+_WANDER = (4, 4, 4, 4, 10, 10, 10)  # frames over which correlated noise counts at least: as many as an alarm takes
+_SIDEWAYS, _MOST_ALIKE = np.array(AXES) == "lateral", 0.95  # the most that neighbouring frames are taken to correlate
 # By what that raises the variance, before the frames tell: as if so many frames had told it, for few say little of it.
 _RAISES, _RAISES_FRAMES = (1.2, 1.2, 1.2, 1.2, 1.0, 1.3, 1.3), 1500
 _SLOW = 300  # frames over which the bias is averaged
@@ -152,13 +153,19 @@ def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def _long_run_sd(values: np.ndarray, known: int = 0) -> np.ndarray:
     """(k,) of series (n, k): the standard deviation that independent frames would need for means to scatter as these do.
 
-    The autocovariances are summed under a triangle (Bartlett); `_RAISES` counts for `known` frames beside them.
+    The autocovariances are summed under a triangle (Bartlett); `_RAISES` counts for `known` frames beside them.  Sideways a
+    detector can err alike for long.  There the triangle is as wide as the correlation of neighbours asks for (Andrews 1991),
+    and what it surely shows counts in full.
     """
     n = len(values)
     d = values - values.mean(axis=0)
     variance = (d**2).mean(axis=0)
-    widths, total = np.minimum(_WANDER, n // 8), variance.copy()
+    rho = np.clip((d[1:] * d[:-1]).sum(axis=0) / n / np.maximum(variance, 1e-12), 0.0, _MOST_ALIKE)
+    widths = np.array(_WANDER)
+    widths[_SIDEWAYS] = np.maximum(widths, 1.1447 * np.cbrt(4.0 * rho**2 / (1.0 - rho**2) ** 2 * n))[_SIDEWAYS]
+    widths, total = np.minimum(widths, n // 8), variance.copy()
     for lag in range(1, int(widths.max()) + 1):
         total += 2.0 * np.maximum(1.0 - lag / (widths + 1.0), 0.0) * (d[lag:] * d[:-lag]).sum(axis=0) / n
-    few, least = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2), np.maximum(variance, 0.05)
+    sure = _SIDEWAYS * total / (1.0 + 2.0 * np.sqrt(4.0 / 3.0 * widths / n))  # two of its standard deviations less
+    few, least = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2), np.maximum(np.maximum(variance, sure), 0.05)
     return np.sqrt(few * np.maximum((n * total + known * np.array(_RAISES) * variance) / (n + known), least))
