@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from lib import paths
 from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
@@ -19,6 +22,9 @@ from notebooks.figures.style import figure, show_image
 
 #: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
 _ROWS = (12, 3)
+#: Stereo frames with labels that are enough to calibrate, if they are far apart; reasons that fewer of them give.
+_ENOUGH_LABELS = 10
+_OF_FEW = ("few_frames", "few_rows", "coverage", "cross_validation")
 #: What a `health_chart` shows.
 HEALTH_CAPTION = (
     "The score of each frame. Above the red line its landmarks contradict themselves, the other image or the robot, the "
@@ -44,6 +50,24 @@ def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Cali
             "affine ones, so its rest is left out. Notebooks 00 and 07 reconstruct with the cameras as they are."
         )
     return assessed.calibration
+
+
+def labelled_pairs(recording: Recording) -> int:
+    """How many stereo frames have a label in both images."""
+    if (marks := recording.annotations) is None:
+        return 0
+    return int((np.isfinite(marks.u_left) & np.isfinite(marks.u_right)).all(axis=2).any(axis=1).sum())
+
+
+def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
+    """An assessment of labels; where they are few and frames are left, its cures ask for more labels, not for more frames."""
+    pairs = labelled_pairs(recording)
+    if pairs >= min(_ENOUGH_LABELS, len(recording)):
+        return assessed
+    where = shlex.quote(paths.shown(recording.folder))
+    cure = f"Label more stereo frames, far apart: `python3 -m lib annotate {where}`; {_ENOUGH_LABELS} are enough."
+    reasons = [replace(one, cure=cure) if one.name in _OF_FEW else one for one in assessed.verdict.reasons]
+    return replace(assessed, verdict=Verdict(tuple(reasons)))
 
 
 def cameras_in_words(calibration: Calibration) -> str:
@@ -114,7 +138,8 @@ def health_chart(found: Health) -> Figure:
         low = np.fmin.reduce(unfamiliar, initial=low)
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * low, max(2.0, 1.2 * score.max())))
-    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {found.text}."
+    told = found.text if found.seen.any() else "No frame has a landmark"
+    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {told}."
     ax.set_title("\n".join(textwrap.wrap(said, 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
