@@ -307,7 +307,11 @@ def test_notebook_7_puts_a_named_cause_before_the_detector(small, monkeypatch, c
     said = answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause="clock")
     assert "Enough motion? Not known" in said and "Is the detector usable? Yes." in said
     assert "Do the clocks agree? No. Text of clock. Cure of clock. Is" in said
-    assert "Then what? Text of clock. Cure of clock." in said
+    assert "Then what? Cure of clock." in said
+    monkeypatch.undo()
+    moved = ("camera_moved", red, "Text of camera_moved.", "Cure of camera_moved.")
+    said = answers_of_notebook_7(small, monkeypatch, capsys, moved, *reasons[1:], cause="camera_moved")
+    assert "Then what? Text of camera_moved. Cure of camera_moved." in said
 
 
 def test_notebook_7_without_a_cause_asks_for_the_detector_and_for_motion(small, monkeypatch, capsys):

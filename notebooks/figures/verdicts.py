@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,8 @@ from lib import paths
 from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
-from lib.trust import Assessment, Health, Verdict
+from lib.trust import Assessment, Health, Reason, Verdict
+from lib.trust.health import BY_ROBOT
 from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
@@ -25,6 +26,13 @@ _ROWS = (12, 3)
 #: Stereo frames with labels that are enough to calibrate, if they are far apart; reasons that fewer of them give.
 _ENOUGH_LABELS = 10
 _OF_FEW = ("few_frames", "few_rows", "coverage", "cross_validation")
+#: Reasons that speak of too little motion, of cameras that are unsure (by that too, but any cause makes it worse), of times.
+_MOTION, _UNSURE = ("few_frames", "one_line", "one_plane", "thin"), ("coverage", "few_rows", "cross_validation")
+_TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "frame_times", "little_overlap", "slow_log")
+#: Reasons that speak of the detector, and those that do so where no cause is named.
+_UNFIT, _LOST = ("detector_unfit", "bad_landmark", "bad_stretch"), ("no_detection", "no_consensus", "minority")
+#: Stereo frames to label: fewer teach little, and more are rarely needed.
+_FEWEST, _MOST = 10, 20
 #: What a `health_chart` shows.
 HEALTH_CAPTION = (
     "The score of each frame. Above the red line its landmarks contradict themselves, the other image or the robot, the "
@@ -68,6 +76,59 @@ def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
     cure = f"Label more stereo frames, far apart: `python3 -m lib annotate {where}`; {_ENOUGH_LABELS} are enough."
     reasons = [replace(one, cure=cure) if one.name in _OF_FEW else one for one in assessed.verdict.reasons]
     return replace(assessed, verdict=Verdict(tuple(reasons)))
+
+
+def in_words(
+    recording: Recording, assessed: Assessment, next_step: str | None
+) -> tuple[dict[str, str], int, int]:  # fmt: skip
+    """Answers to what the user of a recording asks, how many frames are bad, and of how many.
+
+    A cause that the diagnosis names comes before all that may follow from it.
+
+    Args:
+        next_step: Of `lib.trust.check`; None where labels take the detector's place.
+    """
+    reasons = {reason.name: reason for reason in assessed.verdict.reasons}
+    cause, health = assessed.diagnosis.best, assessed.health
+    named = cause is not None and cause.name in reasons and cause.name != "detector_unfit"
+    if named and cause.name not in _UNFIT:  # what contradicts the robot is no detector's fault
+        health = replace(health, parts={name: part for name, part in health.parts.items() if name not in BY_ROBOT})
+    missed = ~health.seen.any(axis=1) if next_step else False  # frames without labels are not bad
+    bad, frames = int(((health.score > 1) | missed).sum()), len(health.frame)
+
+    moved = "Yes."
+    if named and any(name in reasons for name in _UNSURE):
+        moved = "Not known before the cause below is mended: it leaves the cameras unsure."
+    if assessed.calibration is None:
+        moved = "Not known: there are no cameras yet that could tell."
+    unfit = [reasons[name] for name in _UNFIT + (() if named else _LOST) if name in reasons]
+    first = reasons[cause.name] if named else next(iter(reasons.values()), None)
+    then = "Nothing: go on." if first is None else first.cure
+    untold = named and first.name not in _MOTION + _TIMES
+    if untold or (first and first.name == "refused"):  # the text names what to mend
+        then = f"{first.text} {first.cure}"
+    if next_step and assessed.verdict.is_red and next_step == recording.mistimed:
+        then = next_step  # where the times are wrong, nothing else is known
+    elif next_step and unfit and not named:
+        then = f"Adapt; then label {min(max(bad, _FEWEST), _MOST)} stereo frames."
+    usable = f"{_refusal(unfit)} {bad} of {frames} frames are bad." if unfit else "Yes."
+    answers = {
+        "Enough motion?": _answer(reasons, _MOTION if named else _MOTION + _UNSURE, moved),
+        "Do the clocks agree?": _answer(reasons, _TIMES, "Nothing speaks against it."),
+        "Is the detector usable?": usable if next_step else "Not asked: your labels take its place.",
+        "Then what?": then,
+    }
+    return answers, bad, frames
+
+
+def _answer(reasons: Mapping[str, Reason], names: Sequence[str], good: str) -> str:
+    """Those of the reasons that have these names, each with its cure; `good` where there is none."""
+    found = [reasons[name] for name in names if name in reasons]
+    return " ".join([_refusal(found), *(f"{one.text} {one.cure}" for one in found)]) if found else good
+
+
+def _refusal(found: Sequence[Reason]) -> str:
+    return "No." if Verdict(tuple(found)).is_red else "In doubt."
 
 
 def cameras_in_words(calibration: Calibration) -> str:
