@@ -89,6 +89,18 @@ def test_parameters_are_typed_and_commented(path):
     assert path in STUDIES or names[:2] == ["profile", "seed"]
 
 
+@each(WALK + STUDIES)
+def test_a_parameter_keeps_its_value_after_the_first_cells(path):
+    parameters, *others = code_cells(path)
+    names = {statement.target.id for statement in ast.parse(parameters.source).body}
+    for cell in others[3:]:
+        tree = ast.parse("\n".join(line for line in cell.source.splitlines() if not line.startswith("%")))
+        inner = (ast.FunctionDef, ast.Lambda, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+        own = {node for part in ast.walk(tree) if isinstance(part, inner) for node in ast.walk(part)}
+        stored = {n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)} - own
+        assert not names & {node.id for node in stored}, cell.id
+
+
 @each(WALK)
 def test_opens_with_a_title_and_closes_with_lessons_and_exercises(path):
     cells = read(path).cells
