@@ -80,8 +80,8 @@ def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
 
 def in_words(
     recording: Recording, assessed: Assessment, next_step: str | None
-) -> tuple[dict[str, str], int, int]:  # fmt: skip
-    """Answers to what the user of a recording asks, how many frames are bad, and of how many.
+) -> tuple[dict[str, str], int, str]:  # fmt: skip
+    """Answers to what the user of a recording asks, how many frames are bad, and a note on that number.
 
     A cause that the diagnosis names comes before all that may follow from it.
 
@@ -91,10 +91,14 @@ def in_words(
     reasons = {reason.name: reason for reason in assessed.verdict.reasons}
     cause, health = assessed.diagnosis.best, assessed.health
     named = cause is not None and cause.name in reasons and cause.name != "detector_unfit"
+    frames, note = len(health.frame), f"of {len(health.frame)}: their score is above 1"
     if named and cause.name not in _UNFIT:  # what contradicts the robot is no detector's fault
         health = replace(health, parts={name: part for name, part in health.parts.items() if name not in BY_ROBOT})
-    missed = ~health.seen.any(axis=1) if next_step else False  # frames without labels are not bad
-    bad, frames = int(((health.score > 1) | missed).sum()), len(health.frame)
+        note += " without what contradicts the robot, since another cause is named"
+    missed = np.zeros(frames, dtype=bool)
+    if next_step:  # frames without labels are not bad
+        missed, note = ~health.seen.any(axis=1), f"{note}, or nothing is found"
+    bad = int(((health.score > 1) | missed).sum())
 
     moved = "Yes."
     if named and any(name in reasons for name in _UNSURE):
@@ -118,7 +122,7 @@ def in_words(
         "Is the detector usable?": usable if next_step else "Not asked: your labels take its place.",
         "Then what?": then,
     }
-    return answers, bad, frames
+    return answers, bad, note
 
 
 def _answer(reasons: Mapping[str, Reason], names: Sequence[str], good: str) -> str:
