@@ -351,6 +351,20 @@ def test_notebook_7_asks_for_more_labels_where_few_frames_have_some(labelled, sm
     assert run.captions[0] == "Your labels in frame 0." and run.left_out is None
 
 
+def test_wrong_labels_come_before_the_noise_that_they_make(small):
+    parts = {"epipolar": np.full((6, 3), 0.5), "robot": np.full((6, 3), 2.0)}
+    red, health = trust.LEVELS[-1], trust.Health(np.arange(6), parts, np.ones((6, 3), dtype=bool))
+    reasons = (trust.Reason("robot_noise", red, "Noise.", "Check."), trust.Reason("minority", red, "Few.", "Look again."))
+    found = SimpleNamespace(
+        verdict=trust.Verdict(reasons), diagnosis=SimpleNamespace(best=SimpleNamespace(name="robot_noise")),
+        health=health, calibration=None,
+    )  # fmt: skip
+    answers, bad, _ = verdicts.in_words(Recording.open(small), found, None)
+    assert answers["Then what?"] == "Look again." and bad == 6
+    answers, bad, note = verdicts.in_words(Recording.open(small), found, "Check.")
+    assert answers["Then what?"] == "Noise. Check." and bad == 0 and "another cause" in note
+
+
 def test_notebook_7_says_what_it_needs_of_landmarks_and_weights(small, tmp_path, monkeypatch):
     other = Path(shutil.copytree(small, tmp_path / "other"))
     for file in ("recording.toml", "kinematics.csv"):

@@ -90,7 +90,8 @@ def in_words(
     """
     reasons = {reason.name: reason for reason in assessed.verdict.reasons}
     cause, health = assessed.diagnosis.best, assessed.health
-    named = cause is not None and cause.name in reasons and cause.name != "detector_unfit"
+    vague = ("detector_unfit",) if next_step else ("detector_unfit", "robot_noise")  # wrong labels look like noise, too
+    named = cause is not None and cause.name in reasons and cause.name not in vague
     frames, note = len(health.frame), f"of {len(health.frame)}: their score is above 1"
     if named and cause.name not in _UNFIT:  # what contradicts the robot is no detector's fault
         health = replace(health, parts={name: part for name, part in health.parts.items() if name not in BY_ROBOT})
@@ -107,6 +108,8 @@ def in_words(
         moved = "Not known: there are no cameras yet that could tell."
     unfit = [reasons[name] for name in _UNFIT + (() if named else _LOST) if name in reasons]
     first = reasons[cause.name] if named else next(iter(reasons.values()), None)
+    if unfit and not named and not next_step:  # the labels come before what may follow from them
+        first = unfit[0]
     then = "Nothing: go on." if first is None else first.cure
     untold = named and first.name not in _MOTION + _TIMES
     if untold or (first and first.name == "refused"):  # the text names what to mend
