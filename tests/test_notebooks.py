@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import re
+import shutil
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ import pytest
 
 from lib import paths, trust
 from lib.landmarks import Detector, Landmarks
-from lib.recordings import Recording, RecordingWriter
+from lib.recordings import Annotator, Recording, RecordingWriter
 from lib.trust import check
 from lib.workbench import pages, report, results
 from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
@@ -86,6 +87,18 @@ def test_parameters_are_typed_and_commented(path):
         assert re.search(r"#\s+\S+", line), f"what is it? {line}"
         names.append(statement.target.id)
     assert path in STUDIES or names[:2] == ["profile", "seed"]
+
+
+@each(WALK + STUDIES)
+def test_a_parameter_keeps_its_value_after_the_first_cells(path):
+    parameters, *others = code_cells(path)
+    names = {statement.target.id for statement in ast.parse(parameters.source).body}
+    for cell in others[3:]:
+        tree = ast.parse("\n".join(line for line in cell.source.splitlines() if not line.startswith("%")))
+        inner = (ast.FunctionDef, ast.Lambda, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+        own = {node for part in ast.walk(tree) if isinstance(part, inner) for node in ast.walk(part)}
+        stored = {n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)} - own
+        assert not names & {node.id for node in stored}, cell.id
 
 
 @each(WALK)
@@ -287,6 +300,79 @@ def test_notebook_7_says_what_to_do_on_a_red_verdict(small, monkeypatch, capsys)
     monkeypatch.setattr(check, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=red))
     assert "not trustworthy" in Run("07", small, monkeypatch).left_out
     assert re.search(r"^Then what\? +Look\.$", capsys.readouterr().out, re.MULTILINE)
+
+
+def answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause=None):
+    """What notebook 7 answers in words where the verdict has these reasons: (name, level, text, cure)."""
+    told = trust.Verdict(tuple(trust.Reason(*reason) for reason in reasons))
+    found = None if cause is None else SimpleNamespace(name=cause, text="The cause.", cure="Mend the cause.")
+    assess, diagnosis = check.assess, SimpleNamespace(best=found, hypotheses=())
+    monkeypatch.setattr(
+        check, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=told, diagnosis=diagnosis)
+    )
+    Run("07", small, monkeypatch)
+    return re.sub(r"\s+", " ", capsys.readouterr().out)
+
+
+def test_notebook_7_puts_a_named_cause_before_the_detector(small, monkeypatch, capsys):
+    red = trust.LEVELS[-1]
+    reasons = [(name, red, f"Text of {name}.", f"Cure of {name}.") for name in ("clock", "no_consensus", "coverage")]
+    said = answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause="clock")
+    assert "Enough motion? Not known" in said and "Is the detector usable? Yes." in said
+    assert "Do the clocks agree? No. Text of clock. Cure of clock. Is" in said
+    assert "Then what? Cure of clock." in said
+    monkeypatch.undo()
+    moved = ("camera_moved", red, "Text of camera_moved.", "Cure of camera_moved.")
+    said = answers_of_notebook_7(small, monkeypatch, capsys, moved, *reasons[1:], cause="camera_moved")
+    assert "Then what? Text of camera_moved. Cure of camera_moved." in said
+
+
+def test_notebook_7_without_a_cause_asks_for_the_detector_and_for_motion(small, monkeypatch, capsys):
+    levels = {"no_consensus": trust.LEVELS[-1], "one_plane": trust.LEVELS[1], "thin": trust.LEVELS[1]}
+    reasons = [(name, level, f"Text of {name}.", f"Cure of {name}.") for name, level in levels.items()]
+    said = answers_of_notebook_7(small, monkeypatch, capsys, *reasons)
+    assert "Enough motion? In doubt. Text of one_plane. Cure of one_plane. Text of thin. Cure of thin. Do" in said
+    assert re.search(r"usable\? No\. \d of 6 frames are bad\. Then what\? Adapt; then label 10 stereo frames\.", said)
+
+
+@pytest.mark.parametrize("labelled", [0, 1, 4])
+def test_notebook_7_asks_for_more_labels_where_few_frames_have_some(labelled, small, tmp_path, monkeypatch, capsys):
+    mine = Path(shutil.copytree(small, tmp_path / "my labels"))
+    annotator = Annotator(Recording.open(mine))
+    for number in range(labelled):
+        for side, u in zip(("left", "right"), Seer(True).u[number], strict=True):
+            for name, point in zip(annotator.recording.skeleton, u, strict=True):
+                annotator.mark(side, number, name, tuple(point))
+    run = Run("07", mine, monkeypatch, landmarks="annotations", force=True)
+    if labelled < 2:
+        assert f"labels in {labelled} stereo frames" in run.left_out and not run.verdicts
+        return
+    cures = [reason.cure for reason in run.verdicts[0].reasons if reason.name == "few_frames"]
+    assert len(cures) == 1 and "annotate" in cures[0] and "Record more" not in capsys.readouterr().out
+    assert run.captions[0] == "Your labels in frame 0." and run.left_out is None
+
+
+def test_wrong_labels_come_before_the_noise_that_they_make(small):
+    parts = {"epipolar": np.full((6, 3), 0.5), "robot": np.full((6, 3), 2.0)}
+    red, health = trust.LEVELS[-1], trust.Health(np.arange(6), parts, np.ones((6, 3), dtype=bool))
+    reasons = (trust.Reason("robot_noise", red, "Noise.", "Check."), trust.Reason("minority", red, "Few.", "Look again."))
+    found = SimpleNamespace(
+        verdict=trust.Verdict(reasons), diagnosis=SimpleNamespace(best=SimpleNamespace(name="robot_noise")),
+        health=health, calibration=None,
+    )  # fmt: skip
+    answers, bad, _ = verdicts.in_words(Recording.open(small), found, None)
+    assert answers["Then what?"] == "Look again." and bad == 6
+    answers, bad, note = verdicts.in_words(Recording.open(small), found, "Check.")
+    assert answers["Then what?"] == "Noise. Check." and bad == 0 and "another cause" in note
+
+
+def test_notebook_7_says_what_it_needs_of_landmarks_and_weights(small, tmp_path, monkeypatch):
+    other = Path(shutil.copytree(small, tmp_path / "other"))
+    for file in ("recording.toml", "kinematics.csv"):
+        (other / file).write_text((other / file).read_text(encoding="utf-8").replace("tip_2", "end"), encoding="utf-8")
+    assert "-p landmarks annotations" in Run("07", other, monkeypatch).left_out
+    with pytest.raises(ValueError, match="place of a detector"):
+        Run("07", small, monkeypatch, weights="mine.safetensors", landmarks="annotations")
 
 
 def test_what_judges_a_recording_is_said(small, tmp_path):

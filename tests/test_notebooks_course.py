@@ -22,7 +22,7 @@ from lib.workbench import pages, report
 from notebooks.figures import course
 from tests.remembering import remembering_teacher
 
-TAUGHT = ("00", "01", "02", "03", "04", "05", "06")
+TAUGHT = ("00", "01", "02", "03", "04", "05", "06", "08")
 WALK = [path for path in sorted(paths.NOTEBOOKS.glob("*.ipynb")) if path.stem[:2] in TAUGHT]
 EXERCISED = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
 EQUATIONS = range(1, 8)  # of the paper

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+import shlex
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from lib import paths
 from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
-from lib.trust import Assessment, Health, Verdict
+from lib.trust import Assessment, Health, Reason, Verdict
+from lib.trust.health import BY_ROBOT
 from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
 
 #: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
 _ROWS = (12, 3)
+#: Stereo frames with labels that are enough to calibrate, if they are far apart; reasons that fewer of them give.
+_ENOUGH_LABELS = 10
+_OF_FEW = ("few_frames", "few_rows", "coverage", "cross_validation")
+#: Reasons that speak of too little motion, of cameras that are unsure (by that too, but any cause makes it worse), of times.
+_MOTION, _UNSURE = ("few_frames", "one_line", "one_plane", "thin"), ("coverage", "few_rows", "cross_validation")
+_TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "frame_times", "little_overlap", "slow_log")
+#: Reasons that speak of the detector, and those that do so where no cause is named.
+_UNFIT, _LOST = ("detector_unfit", "bad_landmark", "bad_stretch"), ("no_detection", "no_consensus", "minority")
+#: Stereo frames to label: fewer teach little, and more are rarely needed.
+_FEWEST, _MOST = 10, 20
 #: What a `health_chart` shows.
 HEALTH_CAPTION = (
     "The score of each frame. Above the red line its landmarks contradict themselves, the other image or the robot, the "
@@ -44,6 +58,84 @@ def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Cali
             "affine ones, so its rest is left out. Notebooks 00 and 07 reconstruct with the cameras as they are."
         )
     return assessed.calibration
+
+
+def labelled_pairs(recording: Recording) -> int:
+    """How many stereo frames have a label in both images."""
+    if (marks := recording.annotations) is None:
+        return 0
+    return int((np.isfinite(marks.u_left) & np.isfinite(marks.u_right)).all(axis=2).any(axis=1).sum())
+
+
+def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
+    """An assessment of labels; where they are few and frames are left, its cures ask for more labels, not for more frames."""
+    pairs = labelled_pairs(recording)
+    if pairs >= min(_ENOUGH_LABELS, len(recording)):
+        return assessed
+    where = shlex.quote(paths.shown(recording.folder))
+    cure = f"Label more stereo frames, far apart: `python3 -m lib annotate {where}`; {_ENOUGH_LABELS} are enough."
+    reasons = [replace(one, cure=cure) if one.name in _OF_FEW else one for one in assessed.verdict.reasons]
+    return replace(assessed, verdict=Verdict(tuple(reasons)))
+
+
+def in_words(
+    recording: Recording, assessed: Assessment, next_step: str | None
+) -> tuple[dict[str, str], int, str]:  # fmt: skip
+    """Answers to what the user of a recording asks, how many frames are bad, and a note on that number.
+
+    A cause that the diagnosis names comes before all that may follow from it.
+
+    Args:
+        next_step: Of `lib.trust.check`; None where labels take the detector's place.
+    """
+    reasons = {reason.name: reason for reason in assessed.verdict.reasons}
+    cause, health = assessed.diagnosis.best, assessed.health
+    vague = ("detector_unfit",) if next_step else ("detector_unfit", "robot_noise")  # wrong labels look like noise, too
+    named = cause is not None and cause.name in reasons and cause.name not in vague
+    frames, note = len(health.frame), f"of {len(health.frame)}: their score is above 1"
+    if named and cause.name not in _UNFIT:  # what contradicts the robot is no detector's fault
+        health = replace(health, parts={name: part for name, part in health.parts.items() if name not in BY_ROBOT})
+        note += " without what contradicts the robot, since another cause is named"
+    missed = np.zeros(frames, dtype=bool)
+    if next_step:  # frames without labels are not bad
+        missed, note = ~health.seen.any(axis=1), f"{note}, or nothing is found"
+    bad = int(((health.score > 1) | missed).sum())
+
+    moved = "Yes."
+    if named and any(name in reasons for name in _UNSURE):
+        moved = "Not known before the cause below is mended: it leaves the cameras unsure."
+    if assessed.calibration is None:
+        moved = "Not known: there are no cameras yet that could tell."
+    unfit = [reasons[name] for name in _UNFIT + (() if named else _LOST) if name in reasons]
+    first = reasons[cause.name] if named else next(iter(reasons.values()), None)
+    if unfit and not named and not next_step:  # the labels come before what may follow from them
+        first = unfit[0]
+    then = "Nothing: go on." if first is None else first.cure
+    untold = named and first.name not in _MOTION + _TIMES
+    if untold or (first and first.name == "refused"):  # the text names what to mend
+        then = f"{first.text} {first.cure}"
+    if next_step and assessed.verdict.is_red and next_step == recording.mistimed:
+        then = next_step  # where the times are wrong, nothing else is known
+    elif next_step and unfit and not named:
+        then = f"Adapt; then label {min(max(bad, _FEWEST), _MOST)} stereo frames."
+    usable = f"{_refusal(unfit)} {bad} of {frames} frames are bad." if unfit else "Yes."
+    answers = {
+        "Enough motion?": _answer(reasons, _MOTION if named else _MOTION + _UNSURE, moved),
+        "Do the clocks agree?": _answer(reasons, _TIMES, "Nothing speaks against it."),
+        "Is the detector usable?": usable if next_step else "Not asked: your labels take its place.",
+        "Then what?": then,
+    }
+    return answers, bad, note
+
+
+def _answer(reasons: Mapping[str, Reason], names: Sequence[str], good: str) -> str:
+    """Those of the reasons that have these names, each with its cure; `good` where there is none."""
+    found = [reasons[name] for name in names if name in reasons]
+    return " ".join([_refusal(found), *(f"{one.text} {one.cure}" for one in found)]) if found else good
+
+
+def _refusal(found: Sequence[Reason]) -> str:
+    return "No." if Verdict(tuple(found)).is_red else "In doubt."
 
 
 def cameras_in_words(calibration: Calibration) -> str:
@@ -114,7 +206,8 @@ def health_chart(found: Health) -> Figure:
         low = np.fmin.reduce(unfamiliar, initial=low)
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * low, max(2.0, 1.2 * score.max())))
-    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {found.text}."
+    told = found.text if found.seen.any() else "No frame has a landmark"
+    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {told}."
     ax.set_title("\n".join(textwrap.wrap(said, 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
