@@ -91,6 +91,8 @@ class Health:
     @property
     def text(self) -> str:
         """What is unhealthy, in words without a full stop."""
+        if not self.seen.any():
+            return "No frame has a landmark"
         what = "themselves, the other image or the robot" if "robot" in self.parts else "themselves or the other image"
         return f"{100 * self.unhealthy:.0f} % of the landmarks found contradict {what}"
 

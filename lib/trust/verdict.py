@@ -166,7 +166,7 @@ def judge(
     if health is not None:
         if best is not None and best.name not in _OF_DETECTOR:  # what contradicts the robot is no detector's fault
             health = replace(health, parts={n: part for n, part in health.parts.items() if n not in BY_ROBOT})
-        text = f"{health.text} (most often: {health.worst_part})."
+        text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
     found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]

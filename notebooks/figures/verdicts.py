@@ -206,8 +206,7 @@ def health_chart(found: Health) -> Figure:
         low = np.fmin.reduce(unfamiliar, initial=low)
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * low, max(2.0, 1.2 * score.max())))
-    told = found.text if found.seen.any() else "No frame has a landmark"
-    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {told}."
+    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {found.text}."
     ax.set_title("\n".join(textwrap.wrap(said, 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")

@@ -525,3 +525,19 @@ def test_angles_of_a_motion_are_about_the_fixed_axes_in_the_order_x_y_z():
     combined = turns[2].compose(turns[1]).compose(turns[0])
     angles = motion_error(combined, RigidTransform.identity(), np.zeros(3))[1]
     np.testing.assert_allclose(angles, (0.1, -0.2, 0.3), atol=1e-14)
+
+
+def test_errors_that_last_sideways_are_no_move():
+    """A detector that errs alike for some twenty frames: what the frames surely show of that widens the noise."""
+    alarms, shifts, rig = 0, [], reference_rig()
+    for seed in range(3):
+        rng, slow, monitor = np.random.default_rng(seed), np.zeros(2), DriftMonitor(rig, covariance_px2=1.0, sigma_x_mm=0.0)
+        for i in range(640):
+            slow = 0.9 * slow + rng.normal(0, 0.65, 2)
+            x = rng.uniform(-3, 3, (3, 3))
+            moved = 12.0 * (i >= 600)
+            if monitor.update(x, *(v + slow + moved + rng.normal(0, 0.7, v.shape) for v in rig.project(x))):
+                alarms += 100 < i < 600
+                shifts += [i - 600] * (i >= 600)
+                monitor.forget()
+    assert alarms < 10 and len(shifts) >= 3 and min(shifts) < 10
