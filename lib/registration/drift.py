@@ -15,7 +15,7 @@ AXES = ("lateral", "lateral", "lateral", "lateral", "depth", "epipolar", "scatte
 # Shifts of the tool that are tested for, along the principal directions of the rig; half of them counts as none.
 _SHIFT_MM = np.array([[20, 0, 0], [0, 20, 0], [14, 14, 0], [14, -14, 0], [0, 0, 40]]) / 1e3
 _SHIFT_SD = (1.0, 8.0)  # of a frame: least and largest shift that a test is made for; the other axes are tested for 2
-_FRAMES = 20_000  # between false alarms, at least
+_FRAMES = 20_000  # between false alarms, if frames erred independently
 # Most that one frame adds, of the alarm level: so that neither a single bad frame raises an alarm nor, across and along the
 # depth, a detector that is wrong alike for some frames.  That grows with the score between two bounds.
 _LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 1.0, 1.0, 0.1, 0.03, 0.03)
@@ -37,7 +37,7 @@ class DriftMonitor:
     The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow mean of
     the residuals, within half a pixel, and the noise is their own long-run standard deviation, which counts correlated frames
     for what they are worth.  A score z is the residual less its bias in this unit.  It adds to the sum S the logarithm of how
-    much likelier the shift to be noticed makes it; the alarm level keeps false alarms `_FRAMES` frames apart (Siegmund 1985).
+    much likelier the shift to be noticed makes it; the alarm level is that of `_FRAMES` frames (Siegmund 1985).
     The noise to start from is `covariance_px2` of (u_left, u_right), a number, (2, 2) or (4, 4) px^2, and `sigma_x_mm` of the
     robot's report, per coordinate.
 
