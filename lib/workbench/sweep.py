@@ -84,6 +84,7 @@ def sweep(
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     for executed in [executed for executed, row in rows.items() if row == of_file[executed]]:
+        del rows[executed]
         executed.unlink()  # it stated no number; what it lacked may be at hand now
     failures: dict[str, str] = {}
     table = folder / "results.csv"
