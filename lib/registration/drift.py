@@ -161,9 +161,8 @@ def _long_run_sd(values: np.ndarray, known: int = 0) -> np.ndarray:
     d = values - values.mean(axis=0)
     variance = (d**2).mean(axis=0)
     rho = np.clip((d[1:] * d[:-1]).sum(axis=0) / n / np.maximum(variance, 1e-12), 0.0, _MOST_ALIKE)
-    widths = np.array(_WANDER)
-    widths[_SIDEWAYS] = np.maximum(widths, 1.1447 * np.cbrt(4.0 * rho**2 / (1.0 - rho**2) ** 2 * n))[_SIDEWAYS]
-    widths, total = np.minimum(widths, n // 8), variance.copy()
+    wide = _SIDEWAYS * 1.1447 * np.cbrt(4.0 * rho**2 / (1.0 - rho**2) ** 2 * n)
+    widths, total = np.minimum(np.maximum(_WANDER, wide).astype(int), n // 8), variance.copy()
     for lag in range(1, int(widths.max()) + 1):
         total += 2.0 * np.maximum(1.0 - lag / (widths + 1.0), 0.0) * (d[lag:] * d[:-lag]).sum(axis=0) / n
     sure = _SIDEWAYS * total / (1.0 + 2.0 * np.sqrt(4.0 / 3.0 * widths / n))  # two of its standard deviations less

@@ -6,9 +6,10 @@ same.  And pictures whose colours and details are unlike those of the training a
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Self
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ LIMITS = {
 #: Parts that are of a frame: they tell no wrong landmark.
 _OF_FRAMES = ("shape", "unfamiliar")
 #: Parts that take the robot's report for right.
-BY_ROBOT = ("robot", "smoothness", "shape")
+_BY_ROBOT = ("robot", "smoothness", "shape")
 #: Medians and standard deviations of `looks` over 288 pictures of the training population.
 _FAMILIAR = np.array([
     [0.32, -0.23, -2.49, -2.54, -0.76, -1.80, -3.38, -2.91, -2.76], [0.32, 0.31, 0.82, 0.82, 0.47, 0.52, 0.66, 0.60, 0.59],
@@ -87,6 +88,11 @@ class Health:
     def worst_part(self) -> str:
         """The part that most landmarks fail of themselves."""
         return max((n for n in self.parts if n not in _OF_FRAMES), key=lambda name: np.sum(self.parts[name] > 1))
+
+    @property
+    def without_robot(self) -> Self:
+        """The same without the parts that take the robot's report for right."""
+        return replace(self, parts={name: part for name, part in self.parts.items() if name not in _BY_ROBOT})
 
     @property
     def text(self) -> str:

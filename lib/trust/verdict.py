@@ -16,7 +16,7 @@ from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataE
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
-from lib.trust.health import BY_ROBOT, Health, feature_matches, health, spread
+from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
 #: From best to worst.
@@ -64,7 +64,7 @@ _LABEL_PX = 3.0
 #: A scene contradicts cameras by which landmarks move more than this, px, and so many times as far as the scene: the tool is
 #: nearer, but not by that much.  A scene that moved farther than the third contradicts a tool that slipped.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
-_OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
+OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
@@ -164,8 +164,8 @@ def judge(
             cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        if best is not None and best.name not in _OF_DETECTOR:  # what contradicts the robot is no detector's fault
-            health = replace(health, parts={n: part for n, part in health.parts.items() if n not in BY_ROBOT})
+        if best is not None and best.name not in OF_DETECTOR:  # what contradicts the robot is no detector's fault
+            health = health.without_robot
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")

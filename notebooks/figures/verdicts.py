@@ -16,7 +16,7 @@ from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 from lib.trust import Assessment, Health, Reason, Verdict
-from lib.trust.health import BY_ROBOT
+from lib.trust.verdict import OF_DETECTOR
 from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
@@ -29,8 +29,8 @@ _OF_FEW = ("few_frames", "few_rows", "coverage", "cross_validation")
 #: Reasons that speak of too little motion, of cameras that are unsure (by that too, but any cause makes it worse), of times.
 _MOTION, _UNSURE = ("few_frames", "one_line", "one_plane", "thin"), ("coverage", "few_rows", "cross_validation")
 _TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "frame_times", "little_overlap", "slow_log")
-#: Reasons that speak of the detector, and those that do so where no cause is named.
-_UNFIT, _LOST = ("detector_unfit", "bad_landmark", "bad_stretch"), ("no_detection", "no_consensus", "minority")
+#: Reasons that speak of the detector where no cause is named.
+_LOST = ("no_detection", "no_consensus", "minority")
 #: Stereo frames to label: fewer teach little, and more are rarely needed.
 _FEWEST, _MOST = 10, 20
 #: What a `health_chart` shows.
@@ -93,8 +93,8 @@ def in_words(
     vague = ("detector_unfit",) if next_step else ("detector_unfit", "robot_noise")  # wrong labels look like noise, too
     named = cause is not None and cause.name in reasons and cause.name not in vague
     frames, note = len(health.frame), f"of {len(health.frame)}: their score is above 1"
-    if named and cause.name not in _UNFIT:  # what contradicts the robot is no detector's fault
-        health = replace(health, parts={name: part for name, part in health.parts.items() if name not in BY_ROBOT})
+    if named and cause.name not in OF_DETECTOR:  # what contradicts the robot is no detector's fault
+        health = health.without_robot
         note += " without what contradicts the robot, since another cause is named"
     missed = np.zeros(frames, dtype=bool)
     if next_step:  # frames without labels are not bad
@@ -106,7 +106,7 @@ def in_words(
         moved = "Not known before the cause below is mended: it leaves the cameras unsure."
     if assessed.calibration is None:
         moved = "Not known: there are no cameras yet that could tell."
-    unfit = [reasons[name] for name in _UNFIT + (() if named else _LOST) if name in reasons]
+    unfit = [reasons[name] for name in OF_DETECTOR + (() if named else _LOST) if name in reasons]
     first = reasons[cause.name] if named else next(iter(reasons.values()), None)
     if unfit and not named and not next_step:  # the labels come before what may follow from them
         first = unfit[0]
