@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from lib.adapt.looking import Seen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
-from lib.calibration.offsets import Unsettled, carried, tool_axes
+from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
@@ -41,17 +41,15 @@ _EXPLAINED = 0.15
 _HARMLESS = 0.01
 #: Share of the frames in which the images may show the whole tool elsewhere than the robot.
 _CONTRADICTED = 0.2
-#: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
-#: has no edge that ends along the shaft: there its error is so many times the deviation that the detector states, if that
-#: is more.  Chosen by recordings of unfamiliar tools and lights, and that of the base by ten of two other renderers as well.
-_OWN_BIAS, _BASE_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]), 2.0
+#: The base has no edge that ends along the shaft: a detector's own error there, as a multiple of the deviation that it states,
+#: if that is more than its `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools by two other renderers as well.
+_BASE_BIAS = 2.0
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
 #: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm, however short the tool.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 #: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
 _TURNS_S = 0.02  # between samples of the log that show how jaws turn; more are not worth their time
-_ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 #: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
 _SURE_MOVE = 0.5
@@ -211,8 +209,8 @@ def teach(
         if fault is not None and not (alone or clicked):
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector takes other points for the tips. {_LABEL}")
         turns = told.turns
-        own = 0.2 * _OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
-        offset, covariance = _robots_share(told, own * length)
+        own = 0.2 * OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
+        offset, covariance = robots_part(told, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
@@ -247,10 +245,10 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
 
 
 def _own_bias(seen: Seen) -> np.ndarray:
-    """Standard deviations (3, 3) of a detector's own constant errors, as `_OWN_BIAS`, from how sure it is of the base."""
+    """Standard deviations (3, 3) of a detector's own constant errors, as `OWN_BIAS`, from how sure it is of the base."""
     along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
     stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
-    own = _OWN_BIAS.copy()
+    own = OWN_BIAS.copy()
     own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
     return own
 
@@ -415,20 +413,6 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     best = diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
-
-
-def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the offsets (3, 3) that is the robot's, and its covariance (3, 3, 3); the rest is the detector's own.
-
-    Both have Gaussian priors: the detector's of `own_sd` (3, 3) mm, the robot's of the width that makes the nine numbers most
-    probable.  Offsets no larger than a detector's usual ones are taken for the detector's.
-    """
-    widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
-    total = widths**2 + own_sd**2 + found.standard_deviation**2
-    width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
-    # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
-    share = width**2 / (width**2 + own_sd**2)
-    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)[:, :, None] ** 2 * np.eye(3)
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:

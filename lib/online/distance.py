@@ -1,8 +1,8 @@
 """From tip to retina: where each landmark is, how far from the surface, and how sure that is.
 
-A landmark lies where the robot reports it, plus a correction that changes slowly: a tool that slips, a robot that bends.
-A Kalman filter follows the correction, which each frame's triangulated landmarks measure.  So the distances have the
-robot's small noise and not the detector's.
+A landmark lies where the robot reports it, plus the robot's constant error that the calibration found, plus a correction
+that changes slowly: a tool that slips, a robot that bends.  A Kalman filter follows the correction, which each frame's
+triangulated landmarks measure.  So the distances have the robot's small noise and not the detector's.
 """
 
 from dataclasses import dataclass
@@ -60,8 +60,9 @@ class TipDistance:
                 gain = self._covariance[k] @ np.linalg.inv(self._covariance[k] + noise[k])
                 self._correction[k] += gain @ (gap[k] - self._correction[k])
                 self._covariance[k] = (np.eye(3) - gain) @ self._covariance[k]
-        x = np.where(robot[:, None], x_mm + self._correction, seen)
-        own = self._covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
+        error_mm, error_covariance = tracker.robots_error(result.landmarks)
+        x = np.where(robot[:, None], x_mm + error_mm + self._correction, seen)
+        own = self._covariance + error_covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
         covariance = np.where(robot[:, None, None], own, covariance)
         age_s = float("nan") if at is None else result.time_s - at.time_s
         if not 0.0 <= age_s <= self.settings.stale_s:  # below 0 where the clock started again

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from lib.calibration import Calibration, LandmarkOffsets, OnlineCalibration, with_offsets
-from lib.calibration.offsets import rows_axes
+from lib.calibration.offsets import OWN_BIAS, robots_part, rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.online.causes import CONVINCING, explain, misfit
@@ -314,9 +314,27 @@ class RigTracker:
             return data
         if (alone := _corrected_alone(data, offsets)) is not None:
             return alone
+        return with_offsets(self._with_past(data), offsets).of_frames(data.frame)
+
+    def robots_error(self, data: Correspondences) -> tuple[np.ndarray, np.ndarray]:
+        """(3, 3) mm from the reported landmarks of a frame to those of the tool, and the covariance (3, 3, 3) of that.
+
+        This is the part of the calibrated offsets that is the robot's error; the detector's own is no place of the tool.
+        """
+        offsets = None if self.calibration is None else self.calibration.offsets
+        if offsets is None or offsets.offset.shape != (3, 3):
+            return np.zeros((3, 3)), np.zeros((3, 3, 3))
+        rows = data if _corrected_alone(data, offsets) is not None else self._with_past(data)
+        axes, x = rows_axes(rows, offsets.offset if offsets.turns else None, carry=True)[-1], data.grid("x_mm")[0]
+        if not np.isfinite(axes).all():
+            return np.zeros((3, 3)), (offsets.offset**2).sum(axis=1)[:, None, None] * np.eye(3)
+        part, covariance = robots_part(offsets, OWN_BIAS * np.linalg.norm(x[1:].mean(axis=0) - x[0]))
+        return part @ axes.T, axes @ covariance @ axes.T
+
+    def _with_past(self, data: Correspondences) -> Correspondences:
+        """The rows of a frame after those of the trusted frames before it."""
         past = (part for part in (*self._open, *self._past) if int(part.frame[0]) not in self._doubtful)
-        before = [part for part in past if part.frame[-1] < data.frame[0]]
-        return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
+        return Correspondences.join([*(part for part in past if part.frame[-1] < data.frame[0]), data])
 
     def _is_open(self, data: Correspondences) -> bool:
         """Whether a frame tells the tool's axes, however its landmarks are off: the tips are too far apart to be crossed."""

@@ -305,6 +305,20 @@ def test_landmark_offsets_are_learnt_and_raise_no_alarm():
     assert all(r.state == "tracking" for r in results[10:])
 
 
+def test_distances_are_those_of_the_tool_and_not_of_the_robots_report():
+    """The robot reports each landmark 0.2 mm beside where it is, which a detector's own error hardly explains."""
+    world = World(2)
+    told = world.x_mm - np.einsum("nij,kj->nki", tool_axes(world.x_mm), [[0.2, 0.0, 0.05], [0.2, 0.0, 0.1], [0.2, 0.0, 0.1]])
+    pipeline, error_mm, sd_mm = make(world, settings=SELDOM), [], []
+    for i in range(60):
+        world.advance()
+        result = pipeline.step(*world.images, told[i] + world.rng.normal(0, 0.01, (3, 3)))
+        error_mm.append(result.distance_mm - world.true_distance_mm())
+        sd_mm.append(result.distance_sd_mm)
+    assert np.abs(np.mean(error_mm[30:], axis=0)).max() < 0.04
+    assert (np.abs(error_mm[30:]) < 3.5 * np.array(sd_mm[30:])).all() and np.max(sd_mm[30:]) < 0.1
+
+
 @pytest.mark.parametrize("shut", [0, 65], ids=["now and then", "for long"])
 def test_jaws_that_the_robot_reports_crossed_raise_no_alarm(shut):
     """Its tips are 0.15 mm off, so it reports shut jaws crossed; the frames before tell which tip is which."""
@@ -333,6 +347,9 @@ def test_jaws_that_the_robot_reports_crossed_raise_no_alarm(shut):
     for x in told:
         world.advance()
         results.append(pipeline.step(*world.images, x))
+        if len(results) != wrong + 1:
+            error_mm = np.abs(results[-1].distance_mm - world.true_distance_mm())
+            assert (error_mm < 4 * results[-1].distance_sd_mm).all()
     assert all(r.motion is None for r in results)
     assert {i for i, r in enumerate(results) if r.state != "tracking"} <= {wrong}
 
