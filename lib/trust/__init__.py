@@ -1,4 +1,4 @@
-"""May the numbers of a recording be believed?  Verdicts, diagnoses, the detector's health, and the check of a recording."""
+"""Can the numbers of a recording be trusted?  Verdicts, diagnoses, the health of the detector, the check of a recording."""
 
 from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.fitting import Hypothesis

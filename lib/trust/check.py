@@ -20,15 +20,15 @@ from lib.trust.health import spread
 from lib.trust.verdict import LEVELS, TEMPLATES, Assessment, assess, report
 
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
-_SHOWN = 3  # best frames, and worst
-_MOST_FRAMES = 60  # spread over the recording; more take longer and say little more
+_SHOWN = 3  # number of best frames on the page, and of worst frames
+_MOST_FRAMES = 60  # frames to detect in, spread over the recording; more take longer and add little
 _SHOWN_PX = 760  # width of one image of an overlay
 _USE = "Use it: `python3 -m lib run"
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What `check` found; `facts` answer in words: what is in the folder, clock, read-out, order of the tips, detector."""
+    """The result of `check`.  `facts` describe in words the folder, the clock, the read-out, the order of the tips, etc."""
 
     recording: Recording
     assessment: Assessment
@@ -36,7 +36,7 @@ class Check:
     next_step: str
 
     def to_json(self) -> dict:
-        """verdict, reasons, next_step, facts and the score of each frame, as in check.json."""
+        """The content of check.json: verdict, reasons, next step, facts, numbers, and the score of each frame."""
         a = self.assessment
         hypotheses = [plain({k: v for k, v in vars(h).items() if k != "evidence"}) for h in a.diagnosis.hypotheses[:5]]
         frames = {"frame": a.health.frame.tolist(), "score": plain(a.health.score.tolist())}
@@ -45,7 +45,7 @@ class Check:
         return a.verdict.to_json() | facts | numbers | {"diagnosis": hypotheses, "frames": frames}
 
     def write(self, folder: str | Path) -> Path:
-        """Write check.html and check.json into `folder`; returns the page."""
+        """Write check.html and check.json into `folder`; returns the path of check.html."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / "check.json", self.to_json())
@@ -66,17 +66,17 @@ class Check:
         for place, i in enumerate(dict.fromkeys([*order[:_SHOWN], *order[::-1][:_SHOWN]])):
             number, score = int(health.frame[i]), health.score[i]
             rows = data.of_frames(number)
-            seen = rows.stacked_px.reshape(-1, 2, 2).swapaxes(0, 1)
-            told = None if c is None else np.stack(c.pair.project(rows.x_mm))
-            picture = data_uri(overlay(self.recording.frames[number], seen, told), ".jpg")
+            detected_px = rows.stacked_px.reshape(-1, 2, 2).swapaxes(0, 1)
+            robot_px = None if c is None else np.stack(c.pair.project(rows.x_mm))
+            picture = data_uri(overlay(self.recording.frames[number], detected_px, robot_px), ".jpg")
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
-            why = f"score {score:.2g}, most of it {max(parts, key=parts.get)}" if parts else "nothing was found"
+            why = f"score {score:.2g}, from its part {max(parts, key=parts.get)}" if parts else "nothing was found"
             kind = "good" if score <= 1 else "among the worst" if place < _SHOWN else "bad"
             found.append((f"Frame {number} ({kind}): {why}.", picture))
         return found
 
     def _coverage(self) -> np.ndarray:
-        """Where the tool was: over the left image, in depth, and in time with the score of each frame."""
+        """The figure of coverage as RGB pixels: the tool in the left image, its z over time, the score of each frame."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -99,12 +99,12 @@ class Check:
         return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
-def check(
-    recording: str | Path | Recording, *, detector: Callable | None = None, frames: range | None = None
-) -> Check:  # fmt: skip
-    """Detect (by the detector that ships, if none is given), calibrate, diagnose and judge a recording or its `frames`.
+def check(recording: str | Path | Recording, *, detector: Callable | None = None, frames: range | None = None) -> Check:
+    """Detect landmarks, calibrate, diagnose and judge a recording or some of its `frames`.
 
-    The truth of a recording given by its folder is never opened.  A FileNotFoundError or ValueError if it cannot be read.
+    Without `detector`, the one that ships is used; a recording of another tool than a forceps is judged by its labels.
+    The ground truth of a recording given by its folder is never opened.  Raises FileNotFoundError or ValueError if the
+    recording cannot be read.
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
     chosen = range(len(found)) if frames is None else frames
@@ -112,21 +112,21 @@ def check(
         detector = SharedDetector(detector)
         data = detect(found, detector, frames=np.array(chosen)[spread(len(chosen), _MOST_FRAMES)])
     elif detector is not None:
-        raise ValueError(f"detector (--weights): none knows {', '.join(found.skeleton)}; leave it out: labels are judged.")
+        raise ValueError(f"detector (--weights): no detector knows {', '.join(found.skeleton)}; leave it out to use labels.")
     elif (marks := found.annotations) is not None:
         data = of_recording(found, marks.u_left, marks.u_right).of_frames(chosen)
     else:
-        raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
+        raise ValueError(f"{found.folder}: the detector only knows {', '.join(LANDMARKS)}, and there are no annotations.")
     a = assess(found.showing(chosen), data, detector=detector)
     step = _next(found, a, frames).replace("RECORDING", shlex.quote(paths.shown(found.folder)))
     return Check(found, a, _facts(found, a), step)
 
 
 def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
-    """What to do next: where no calibration holds and no cause beyond detector and robot is seen, first mend the times."""
+    """The next step, in words.  Wrong time stamps come first where there is no calibration or no specific cause."""
     best = a.diagnosis.best
-    vague = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
-    if vague and a.verdict.is_red and recording.mistimed:
+    unspecific = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
+    if unspecific and a.verdict.is_red and recording.mistimed:
         return recording.mistimed
     if a.verdict.level != LEVELS[0]:
         return a.verdict.reasons[0].cure if best is None else best.cure
@@ -137,7 +137,7 @@ def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
 
 
 def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
-    """Answers to what a user asks first."""
+    """What a user asks first: title -> answer in words."""
     time_s, log, x, c = recording.frames.time_s, recording.kinematics, a.data.complete.x_mm, a.calibration
     clock_s = (0.0, np.inf) if c is None else clock_error(c, a.data, log, recording.offset_s)
     text = TEMPLATES.get_template("facts.txt").render(
@@ -149,7 +149,7 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
 
 
 def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width_px: int = _SHOWN_PX) -> np.ndarray:
-    """Left and right image with rings at landmarks `seen` (2, 3, 2) px and crosses where the robot is `told` to be."""
+    """Both images side by side, RGB: rings at detections `seen` (2, k, 2) px, crosses at the robot's, `told` (2, k, 2) px."""
     images = []
     for side, image in enumerate((frame.left, frame.right)):
         scale = width_px / image.shape[1]
@@ -158,7 +158,7 @@ def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width
             for colour, width in ((255, 255, 255), 3), (_COLOURS[k % 3].tolist(), 2):
                 if np.isfinite(seen[side, k]).all():
                     cv2.circle(picture, np.rint(seen[side, k] * scale).astype(int), 9, colour, width, cv2.LINE_AA)
-                if told is not None and np.abs(told[side, k]).max() < 1e5:  # not NaN
+                if told is not None and np.abs(told[side, k]).max() < 1e5:  # neither NaN nor far outside
                     at = np.rint(told[side, k] * scale).astype(int)
                     cv2.drawMarker(picture, at, colour, cv2.MARKER_CROSS, 18, width, cv2.LINE_AA)
         images.append(picture)
@@ -166,25 +166,25 @@ def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width
 
 
 def data_uri(image: np.ndarray, suffix: str) -> str:
-    """An RGB image as text that a page embeds."""
+    """An RGB image as a data URI, which a page can embed."""
     text = base64.b64encode(encoded(image, suffix)).decode("ascii")
     return f"data:image/{'jpeg' if suffix == '.jpg' else 'png'};base64,{text}"
 
 
 def main(argv: list[str]) -> int:
-    """`python3 -m lib check`; exit code 0 for a finished check whatever the verdict, 2 where the folder cannot be read."""
+    """`python3 -m lib check`; exit code 0 for a finished check with any verdict, 2 if the folder cannot be read."""
     parser = argparse.ArgumentParser(prog="python3 -m lib check", description="Is this recording fit for use; if not, why?")
     parser.add_argument("recording", type=Path, help="the recording's folder")
-    parser.add_argument("--weights", metavar="FILE", help="of the detector (default: those that ship)")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
-    parser.add_argument("--frames", metavar="A:B", help="look at the frames from A to before B; --frames=-10: takes ten")
+    parser.add_argument("--weights", metavar="FILE", help="weights of the detector (default: those that ship)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for check.html and check.json (default: runs/check-NAME)")
+    parser.add_argument("--frames", metavar="A:B", help="check the frames A to B - 1 only; --frames=-10: takes the last ten")
     a = parser.parse_args(argv)
     recording = Recording.open(a.recording, truth=False)
     some = {"frames": recording.frames_of(a.frames)} if a.frames else {}
     part = "".join(f"-{frames.start}-{frames.stop}" for frames in some.values())
     out = a.out or paths.results_folder(f"check-{a.recording.resolve().name}{part}", a.recording)
     found = check(recording, detector=Detector.load(a.weights) if a.weights else None, **some)
-    if a.weights:  # notebook 07 alone takes others than those that ship
+    if a.weights:  # only notebook 07 takes other weights than those that ship
         weights = shlex.quote(a.weights)
         step = found.next_step.replace(_USE, f"{_USE} 07 -p weights {weights}")
         found = replace(found, next_step=step.replace("lib calibrate", f"lib calibrate --weights {weights}"))

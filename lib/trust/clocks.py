@@ -9,16 +9,16 @@ import numpy as np
 from lib.calibration.timing import shift_misfits
 from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust
 
-#: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
+#: Clock rates that are tried: seconds of the robot's clock per second of the video's stated time; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
-_ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search
-_LONGEST_S = 60.0  # its half width where cameras do not fit
-_WORTH = 20.0  # log likelihood that some other clock or order gains, before another one is tried
-_FAR_OFF = 0.01  # a rate that differs by more must make most of the frames fit
+_ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search: most rows, and most trial shifts on each side of 0
+_LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras do not fit or the best shift is at the edge
+_WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too
+_FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 
 
 def _clock(case: Case) -> Iterator[Hypothesis]:
-    """The robot's positions of another instant, for both cameras or for one."""
+    """A clock offset: the images show the robot's positions of another instant, in both cameras or in one."""
     trial, misfit = _scan(case, min(1.0, 0.4 * case.paths.span_s))
     at_edge = np.abs(trial[misfit.sum(axis=1).argmin()]) > 0.9 * trial[-1]
     if at_edge or case.misfit(case.null) >= FITS:
@@ -40,7 +40,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
             cure = f"Add {value:.4f} to offset_s in recording.toml; estimate_time_offset checks it."
         else:
             size, when = size.lstrip("-"), "before" if value < 0 else "after"
-            text = f"The {SIDES[views[0]]} camera alone shows the tool {when} the frame's time, by {size}."
+            text = f"The {SIDES[views[0]]} camera alone shows the tool {size} {when} the frame's time."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({size})."
         yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
@@ -48,7 +48,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
 def _refined(
     case: Case, shift: float, views: tuple[int, ...], rate: float | None = None
 ) -> tuple[Robust, Problem, np.ndarray, np.ndarray] | None:
-    """Gauss-Newton on the shift of the clock (and its rate): the fit, its rows, values and standard deviations."""
+    """Refine the clock's shift (and rate - 1) by Gauss-Newton: the fit, its rows, the values, their standard deviations."""
     time, views = case.problem.time - np.median(case.problem.time), list(views)
     powers = np.ones((1, len(time))) if rate is None else np.stack([np.ones(len(time)), time])
     value, start = np.array([shift] if rate is None else [shift, rate - 1.0]), None
@@ -69,7 +69,7 @@ def _refined(
 
 
 def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Trial shifts (t,) and their misfit (t, 2) in each camera alone."""
+    """Trial shifts (t,) s of the clock, and the misfit (t, 2) of each camera on its own."""
     problem = case.problem
     trial = np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, np.clip(half_s / 0.05, 60, _MOST_TRIALS))) + 1)
     chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
@@ -79,10 +79,10 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
 
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
-    """A wrong frame rate, or frames in reverse; one that is far off is sought only where the residuals are large."""
+    """A wrong frame rate, or frames in reverse order.  Rates far from 1 are tried only if the residuals are large."""
     rate, shift = 1.0, 0.0
     if case.misfit(case.null) >= FITS:
-        # Clocks of other rates may have started together, half the span before its middle.
+        # Clocks of different rates that started together differ by (rate - 1) / 2 of the span in its middle.
         scans = {rate: _scan(case, (0.2 + abs(abs(rate) - 1) / 2) * case.paths.span_s, rate) for rate in (1.0, *_RATES)}
         rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
         trial, misfit = scans[rate]
@@ -90,13 +90,13 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     if (fitted := _refined(case, shift, (0, 1), rate)) is None:
         return
     fit, problem, (shift, value), (shift_sd, sd) = fitted
-    if abs(value) > _FAR_OFF and case.misfit(fit) >= FITS:  # some path or other passes near a part of the frames
+    if abs(value) > _FAR_OFF and case.misfit(fit) >= FITS:  # by chance, part of a path passes near some frames
         return
     if rate < 0:
         text, cure = "The images fit the robot's path run backwards.", "Sort the frames by time."
         yield case.found("frame_order", fit, 4, (0.0, 0.0, ""), text, cure, on=problem)
     elif abs(value) >= max(5.0 * sd, 1e-3):
-        text = f"In one second of the video's time {1 + value:.4f} +- {sd:.4f} s of the robot's pass."
+        text = f"In one second of the video's time {1 + value:.4f} +- {sd:.4f} s of the robot's time pass."
         cure = f"Multiply fps in recording.toml by {1 / (1 + value):.4f}, or write the frames' true times to frames.csv."
         shift -= value * np.median(case.problem.time)
         if abs(shift) > 5.0 * np.hypot(shift_sd, sd * np.median(case.problem.time)):
@@ -105,19 +105,19 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
 
 
 def _frame_order(case: Case) -> Iterator[Hypothesis]:
-    """Each frame at an instant of its own near its stated one."""
+    """Frames that are lost or in a wrong order: each frame may belong to another instant near its stated one."""
     step = np.median(np.diff(np.sort(np.nanmin(case.by_frame(case.problem.time), axis=1))))
     if case.frames < 8 or not 0 < step <= 0.25:
         return
-    trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # lost frames may add up: most fit a later instant
+    trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # after lost frames most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
     steps_px = np.nan_to_num(np.abs(np.diff(case.by_frame(case.problem.y), axis=0))).max(axis=(1, 3), initial=0.0)
     for views in ((0, 1), (0,), (1,)):
         if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:
-            continue  # images come twice
+            continue  # images of this camera repeat; `frozen_video` tests that
         fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
         others = 1e3 * shifts[own][np.abs(shifts[own]) > step / 2]
-        if len(others) < 3:  # it may be a spike of the log
+        if len(others) < 3:  # these may be spikes of the log
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"
@@ -127,15 +127,15 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         if len(views) == 1:
             cure = "Look for images that one camera lost, and pair left and right images of one instant."
         counts = np.bincount(own, minlength=len(shifts)) / case.frames
-        chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
-        chosen += 0.5 * np.count_nonzero(counts) * np.log(case.frames)
-        raw, size = fit.total - case.null.total - chosen, (100 * share, 0.0, "%")
+        penalty = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # entropy of the choices
+        penalty += 0.5 * np.count_nonzero(counts) * np.log(case.frames)  # BIC of their frequencies
+        raw, size = fit.total - case.null.total - penalty, (100 * share, 0.0, "%")
         yield case.found("frame_order", fit, 1, size, text, cure, on=moved, raw=raw, images=views)
 
 
 def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
-    """Images in the order of their names as text (0, 1, 10, 11, ..., 2), counted from 0 or from 1."""
-    if all(fit.total < case.null.total + _WORTH for fit in case.fits.values()):  # other instants explain nothing
+    """Images sorted by their names as text (0, 1, 10, 11, ..., 2), counted from 0 or from 1."""
+    if all(fit.total < case.null.total + _WORTH for fit in case.fits.values()):  # no other clock or order explains anything
         return
     starts, number = np.nanmin(case.by_frame(case.problem.time), axis=1), case.problem.number
     for first, views in product((0, 1), ((0, 1), (0,), (1,))):
@@ -155,7 +155,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 
 
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
-    """A log of moving averages: each is off by the acceleration, times the square of the window, over 24."""
+    """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
     known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
@@ -168,18 +168,18 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
 
 
 def _backlash(case: Case) -> Iterator[Hypothesis]:
-    """A robot that is elsewhere by a constant where it moves the other way along an axis of its frame."""
-    way = np.sign(np.where(case.problem.used.all(axis=1)[:, None], case.velocity(), 0.0))
-    fit = case.linear(lambda M: M[:, :, :3] * np.nan_to_num(way)[:, None, None])
+    """Backlash: positions are displaced by a constant that changes sign with the direction of motion along each axis."""
+    direction = np.sign(np.where(case.problem.used.all(axis=1)[:, None], case.velocity(), 0.0))
+    fit = case.linear(lambda M: M[:, :, :3] * np.nan_to_num(direction)[:, None, None])
     size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
     along = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
-    text = f"The robot has backlash: where it moves the other way it is elsewhere, by {along} um in x, y, z."
-    cure = "Measure positions at the tool's side of the gears, or approach each position from one side."
+    text = f"The robot has backlash: when it reverses, its true position shifts by {along} um in x, y, z."
+    cure = "Measure positions on the tool's side of the gears, or approach each position from one side."
     yield case.found("backlash", fit, 3, (1e3 * size, 1e3 * sd, "um"), text, cure)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:
-    """A rolling shutter of another read-out time; a negative one is that of images that are turned upside down."""
+    """A wrong read-out time of a rolling shutter; a negative one means that images are turned upside down."""
     if case.size is None:
         return
     row = np.clip(case.problem.y[:, :, 1:] / (case.size[1] - 1) - 0.5, -0.6, 0.6)
@@ -196,10 +196,10 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
             cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
             yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known, images=views)
         elif len(views) == 2:
-            text = f"Residuals grow row by row as the tool moves: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."
+            text = f"Residuals of a moving tool grow row by row: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Set readout_s = {max(readout_s, 0.0):.4f} in recording.toml."
             yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
 
 
-#: They need the tool's path in time (`Case.paths`).
+#: Tests that need the tool's path over time (`Case.paths`).
 TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _smoothed_log, _backlash, _readout)

@@ -1,8 +1,8 @@
 """What is wrong with a recording: hypotheses fitted to its correspondences, and compared with "nothing is wrong".
 
-Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`, those of numbers that
-each frame has for itself in `lib.trust.unsteady`.  Each is fitted under heavy-tailed noise (`lib.trust.fitting`).  Its gain
-in log likelihood, less a penalty for its parameters (BIC), is its evidence.
+Hypotheses about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`, those with separate
+parameters for each frame in `lib.trust.unsteady`.  Each hypothesis is fitted with heavy-tailed noise (`lib.trust.fitting`).
+Its evidence is its gain in log likelihood minus a penalty for its parameters (BIC).
 """
 
 from collections import ChainMap
@@ -24,27 +24,27 @@ from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
 from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, is_constant
 
-_MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
+_MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # most rows that are used; three frames leave nothing to check against
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
-_SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # samples of which the median stands for the one in the middle, and what is far off it
-_LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
-_LEAST_LENGTH_MM = 1.0  # which no tool calibration errs by
-_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # of the tool, that the robot's report may lack
-_AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
-_OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
-_RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
-_BENDS = 1.5  # standard deviations that the detector states of the base, below which it moves as tips of a bent tool do
-_UNFIT_SHARE = 0.2  # of the landmarks; fewer gross errors do no harm
+_SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and least distance of a spike from its output
+_LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, and `calibrate` corrects such offsets
+_LEAST_LENGTH_MM = 1.0  # larger than the error of any tool calibration
+_LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # lengths of the tool that are tried, if the robot's report lacks it
+_AS_GOOD = 6.0  # gain in log likelihood of moved cameras (16 numbers) over a slipped tool (3) that rules the latter out
+_OPENED = 1.25  # a smaller factor may come from constant offsets of the tips, which do no harm
+_RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than this in so many frames, noise included
+_BENDS = 1.5  # least motion of a bent tool's tips, as a multiple of the error that the detector states for the base
+_UNFIT_SHARE = 0.2  # least share of gross errors in the landmarks of an unfit detector; fewer do no harm
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
-_NEARLY = 0.05  # of the residuals, by which one cause may explain more without being likelier
-_MOSTLY = 0.5  # of the residuals, which a named cause explains
-_OUTSIDE = 0.25  # of the frames; a log that begins late has fewer, and cameras fit
-_STILL_PX, _STILL_MM = 0.3, 0.04  # detections of one picture, and a robot that rests, differ by less
+_NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
+_MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
+_OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
+_STILL_PX, _STILL_MM = 0.3, 0.04  # detections in copies of one picture vary by less, and so does a robot at rest
 
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
-    """Another landmark's position: tips exchanged in both images, in one, or the base taken for a tip."""
+    """Exchanged landmarks: the tips in both images, in one, or in some frames; or the base taken for a tip."""
     problem = case.problem
     if problem.landmark.max() != 2:
         return
@@ -57,14 +57,14 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
             continue
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
-        cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
+        cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into the same order."
         mirrored = "both images are mirrored, flip them" if len(views) == 2 else "that image is mirrored, flip it"
         cure += f" If {mirrored} instead." if order == (0, 2, 1) else ""
         fit = moved.fit(worth=case.null.total - HOPELESS)
         yield case.found("tip_order", fit, 1, (1.0, 0.0, ""), text, cure, on=moved, images=views)
-    swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
+    swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # exchanged in some frames: one bit a frame
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
-    if not own.any():  # it only found better cameras than `null`
+    if not own.any():  # the gain comes from better cameras than those of `null`
         return
     text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
     cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
@@ -73,22 +73,22 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
-    """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
+    """Landmarks with large offsets from the robot's report, constant in the tool's axes."""
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
     sizes = 1e3 * np.linalg.norm(free.offsets, axis=1)
     size, sd = sizes.max(), 1e3 * free.offset_sd[sizes.argmax()]
     if size - 2.0 * sd > _LEAST_OFFSET_UM:
         far = [k for k in np.argsort(-sizes) if sizes[k] > 2e3 * free.offset_sd[k]]
         each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in free.offsets[k])})" for k in far]
-        text = f"The images show landmarks beside the robot's report, in the tool's axes: {'; '.join(each)}."
+        text = f"Landmarks have constant offsets from the robot's report, in the tool's axes: {'; '.join(each)}."
         cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
-        certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # cameras with offsets have no residuals of them
+        certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # the fit absorbs offsets, so residuals show none
         yield replace(found, gain=max(found.gain, float(certainty)), explained=float(1.0 - _LEAST_OFFSET_UM / size))
 
 
 def _tool_length(case: Case) -> Iterator[Hypothesis]:
-    """All landmarks beside where the robot reports them, alike: it reports another point of the tool."""
+    """One offset of all landmarks: the robot reports another point of the tool, such as its flange."""
     problem, fits = case.problem, []
     y = np.where(problem.used[:, :, None], problem.y, np.nan).reshape(-1, 4)
     for axes in (problem.axes, case.smooth_axes()):
@@ -108,21 +108,21 @@ def _tool_length(case: Case) -> Iterator[Hypothesis]:
 
 
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
-    """Tips that move by other amounts than the base."""
+    """Tips that move more or less than the base, as if the tool bent."""
     tips = case.problem.landmark > 0
     if 0 < tips.mean() < 1 and case.problem.landmark.max() <= 2:
         x = case.problem.x * tips[:, None, None]
         fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
         if size < _BENDS * case.problem.claimed_px(~tips):
-            return  # the detector knows the base no better
+            return  # the detector's error at the base is as large
         text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
         yield case.found("tool_bends", fit, 9, (size, 0.0, "px"), text, cure)
 
 
 def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
-    """Tips that lie by a factor farther apart than the robot reports; of a constant opening that is but an offset."""
+    """Tips whose distance is the reported one times a factor.  With a constant opening this would only be an offset."""
     tips = case.by_frame(case.problem.x[:, 0])[:, 1:]
     width = np.linalg.norm(tips[:, 1] - tips[:, 0], axis=1)
     width = width[np.isfinite(width)]
@@ -132,14 +132,14 @@ def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
     half = (tips[:, 1] - tips[:, 0])[case.problem.frame] * share[:, None]
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None])
     factor, sd = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
-    if 0.0 < factor < 1.0 / _OPENED or factor > _OPENED:  # below 0 they are exchanged
+    if 0.0 < factor < 1.0 / _OPENED or factor > _OPENED:  # below 0 the tips are exchanged
         text = f"In the images the tips are {factor:.2f} +- {sd:.2f} times as far apart as in the robot's report."
         cure = "Does the robot's log state the opening of one jaw or of both? Check that, and the length of the jaws."
         yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
 
 
 def _log_spikes(case: Case) -> Iterator[Hypothesis]:
-    """Single samples of the robot's log that lie elsewhere than those before and after them."""
+    """Single samples of the robot's log that lie far from those before and after them."""
     found, sizes = [], []
     for own in np.swapaxes(case.log, 0, 1) if case.kinematics else ():
         if (known := np.isfinite(own).all(axis=1)).sum() >= _SPIKED:
@@ -159,7 +159,7 @@ def _log_spikes(case: Case) -> Iterator[Hypothesis]:
 
 
 def _drift(case: Case) -> Iterator[Hypothesis]:
-    """Images that creep at a constant speed, or cameras that turn, zoom or move at one."""
+    """A steady drift: the images shift, or the cameras turn, zoom or move, at constant speed."""
     time = case.problem.time
     if not np.isfinite(time).all() or np.ptp(time) == 0:
         return
@@ -179,7 +179,7 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
 
 
 def _bad_part(case: Case) -> Iterator[Hypothesis]:
-    """One landmark, or the stretch of frames of largest residuals (the largest sum of a score, negative on average)."""
+    """Large residuals of one landmark, or of the stretch with the largest sum of a score that is negative on average."""
     problem, parts = case.problem, []
     for k in np.unique(problem.landmark[problem.landmark <= 2]):
         cure = f"Look at the detections of {LANDMARKS[k]} and at its column in kinematics.csv, or calibrate without it."
@@ -207,7 +207,7 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
 
 
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:
-    """Other cameras from one frame on, both or one; or another place of the tool in the robot's hand."""
+    """A change at one frame: one camera or both moved, the images were exchanged, or the tool slipped in its holder."""
     problem = case.problem
     if case.frames < 8:
         return
@@ -226,7 +226,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     if fit.total > both.total - _AS_GOOD:
         size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
         text = f"The tool slipped at about frame {number}, by {size:.0f} um ({along} um in the tool's axes)."
-        cure = f"Fix the tool in its holder, or calibrate before and after on their own ({parts}). "
+        cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
         cure += "Where the tool does not turn, a robot whose zero changed looks the same."
         yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     together = case.linear(problem.of_motion(late[:, 0]))
@@ -237,8 +237,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         how = "moved together" if fit is together else "moved or zoomed"
         text = f"{who} {how} at about frame {number}: the images shift by {size:.1f} px."
-        cure = f"Calibrate before and after on their own ({parts}). "
-        cure += "lib.registration.register_images follows a move, and no zoom."
+        cure = f"Calibrate the frames before and after separately ({parts}). "
+        cure += "lib.registration.register_images can follow a move, but no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)
         yield case.found("camera_moved", fit, fit.theta.size + 3, (size, 0.0, "px"), text, cure, images=views)
 
@@ -251,7 +251,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
     x, left, right, time = (case.by_frame(v) for v in (problem.x[:, 0], problem.y[:, 0], problem.y[:, 1], problem.time))
     velocity = np.diff(x, axis=0) / np.diff(time, axis=0)[..., None]
     sizes = [np.linalg.norm(np.diff(v, axis=0), axis=2) for v in (velocity, x, left, right)]
-    # (frames,) the largest of the landmarks, -1 where all are missing
+    # of each step from frame to frame the largest over the landmarks, -1 where all are missing
     change, step_x, *steps = (np.where(np.isfinite(size), size, -1.0).max(axis=1) for size in sizes)
     step_y = np.maximum(*steps)
     straight = binary_opening(np.append((change >= 0) & (change < 2e-3), False))  # five frames on one line
@@ -259,13 +259,13 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
     def certain(name: str, fit: Robust, repeated: np.ndarray, text: str, cure: str) -> Hypothesis:
         share = 100.0 * float(repeated.mean())
         found = case.found(name, fit, 2, (share, 0.0, "%"), f"In {share:.0f} % of the frames {text}.", cure)
-        gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise repeats no number
+        gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise would not repeat a number
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
     frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
     if frozen.mean() >= 0.02:
         fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
-        if not frozen.all():  # a tool that rests is seen to move by the noise alone
+        if not frozen.all():  # a tool at rest seems to move as far as the noise
             frozen &= step_y > 8 * fit.shapes[0].scale
     if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
@@ -273,7 +273,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         yield certain("frozen_kinematics", fit, frozen, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
-    far = [step > 8 * noise for step in steps]  # of one image alone the other tells whether the tool moved
+    far = [step > 8 * noise for step in steps]  # if one image repeats, the other shows whether the tool moved
     for views, twice in (([0, 1], left & right), ([0], left & far[1]), ([1], right & far[0])):
         if twice.mean() < 0.02 or twice.all():
             continue
@@ -289,7 +289,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
 
 
 def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
-    """Residuals that the best cause leaves: the two images disagree with each other (the detector) or with the robot."""
+    """Faults in the residuals of the best cause: the images disagree with each other (the detector's fault) or the robot."""
     problem = replace(case.problem, seen=case.problem.seen & ~fit.apart[:, None])
     base = case.by_frame(problem.x[:, 0])[problem.frame, 0]
     tools = np.einsum("cij,ncj->nci", fit.M[:, :, :3], problem.x - base[:, None])
@@ -303,7 +303,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     missed = float(np.median(distance[off]))
     zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
     both, half = problem.used.all(axis=1), problem.used.sum() / 2.0
-    distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # NaN of few, which is no witness
+    distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # all NaN if there are few
     witness = distances[off[both].any(axis=1)]
     epipolar = float(np.sqrt(2.0) * np.quantile(witness, 0.75 if off is far else 0.5)) if witness.size else np.nan
     gain = half * (share * np.log(max(share, 1e-9) / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
@@ -316,12 +316,12 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
     if off is not far:
         return []
-    text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
+    text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where the cameras see them."
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
 
 
-def _plainest(found: list[Hypothesis]) -> list[Hypothesis]:
-    """A cause that explains nearly as much goes before one with numbers for each frame, and a clock before its rate."""
+def _prefer_simple(found: list[Hypothesis]) -> list[Hypothesis]:
+    """Lower the gains of `robot_noise` and `clock_rate` below those of simpler causes that explain nearly as much."""
     causes = [h for h in found if h.is_named]
     for name, rivals in (("robot_noise", {h.name for h in causes} - {"robot_noise"}), ("clock_rate", {"clock"})):
         own = max((h.explained for h in causes if h.name == name), default=0.0)
@@ -331,7 +331,7 @@ def _plainest(found: list[Hypothesis]) -> list[Hypothesis]:
 
 
 def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s: float) -> list[Hypothesis]:
-    """A clock so far off that the robot's log is of another time than many frames."""
+    """A clock that is so far off that the robot's log does not cover many of the frames."""
     time = np.unique(data.time_s[data.seen.any(axis=1)]) + offset_s
     if kinematics is None or not len(time) or not np.isfinite(time).all():
         return []
@@ -339,8 +339,8 @@ def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_
     outside = float(((time < first) | (time > last)).mean())
     if outside < _OUTSIDE:
         return []
-    text = f"{100 * outside:.0f} % of the frames, which are of {time[0]:.1f} to {time[-1]:.1f} s of the robot's clock, lie "
-    text += f"outside its log, {first:.1f} to {last:.1f} s."
+    text = f"{100 * outside:.0f} % of the frames ({time[0]:.1f} to {time[-1]:.1f} s on the robot's clock) lie outside "
+    text += f"its log ({first:.1f} to {last:.1f} s)."
     cure = "Check offset_s in recording.toml, and the times in frames.csv and kinematics.csv."
     return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
 
@@ -358,7 +358,7 @@ class Diagnosis:
 
 
 def stated(recording: Recording) -> dict[str, object]:
-    """What a recording states, as `diagnose` takes it."""
+    """What a recording states about clock, shutter, images and robot: keyword arguments of `diagnose`."""
     names = ("kinematics", "offset_s", "readout_s", "image_size_px", "robot_accuracy_mm")
     return {name: getattr(recording, name) for name in names}
 
@@ -372,13 +372,13 @@ def diagnose(
     """Fit every hypothesis about what could be wrong, and rank them.
 
     Args:
-        data: The rows that were, or could not be, calibrated with.
-        kinematics: The robot's log, which tells where the tool was a little earlier or later.  Without it the rows' own
-            positions do, where the frames follow each other within 0.25 s.
-        offset_s, readout_s, image_size_px, robot_accuracy_mm: As the recording states them; without a size nothing is said of
-            the read-out time.
-        near: The cameras that were calibrated have a finite distance, so that it is no fault.
-        offsets: Of the landmarks, as they were calibrated.  They turn the axes of jaws that are nearly shut.
+        data: The rows from which the cameras were calibrated, or could not be calibrated.
+        kinematics: The robot's log, which gives the tool's positions a little earlier or later.  Without it they are
+            interpolated between the rows, if the frames follow each other within 0.25 s.
+        offset_s, readout_s, image_size_px, robot_accuracy_mm: As the recording states them.  Without a size neither the
+            read-out time nor the lenses are tested.
+        near: The calibrated cameras have a finite working distance, which is then no fault.
+        offsets: The calibrated offsets of the landmarks.  They turn the tool's axes where the jaws are nearly shut.
 
     >>> from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
     >>> rng = np.random.default_rng(0)
@@ -388,7 +388,7 @@ def diagnose(
     None
     """
     frames = np.unique(data.frame)
-    if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
+    if len(data) > _MOST_ROWS:  # whole frames, spread evenly
         data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
     problem = Problem.of(data, image_size_px, offsets)
     few = problem.used.all(axis=1).sum() < 6
@@ -406,35 +406,35 @@ def diagnose(
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     log = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
     whole = case = Case(problem, *log)
-    # Where a tool rests its detections repeat one error, which is no fault that begins or ends there.
+    # While a tool rests, its detections repeat one error, which could pass for a fault that begins or ends there.
     x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)
     kept[_RESTS:] = np.linalg.norm(x_mm[_RESTS:] - x_mm[:-_RESTS], axis=2).max(axis=1) > _RESTS_MM
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *log)
-        whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
+        whole.fits = ChainMap({}, case.fits)  # it reads these fits and keeps its own, of other rows, apart
     tests = [_tip_order, _tool_length, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, *FRAME_TESTS]
     found = compared([h for test in tests for h in test(whole if test is _frozen else case)], OF_FRAMES)
     if case.misfit(case.null, *(case.fits[name] for name in _OF_TIME if name in case.fits)) >= FITS:
         found += apart
-    best = Diagnosis(found := _plainest([h for h in found if np.isfinite(h.gain)])).best
-    if best is None:  # other faults look like offsets, too
+    best = Diagnosis(found := _prefer_simple([h for h in found if np.isfinite(h.gain)])).best
+    if best is None:  # not before, since other faults look like offsets, too
         found += _landmark_offset(case)
         best = Diagnosis(found).best
-    turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
+    turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # which exchanges left and right
     if turned and not stands_exchanged(case.fits[best.name]):
         found = [h for h in found if h.name != "turned_image"]
         best, turned = Diagnosis(found).best, False
-    plain = best is None or best.name in OF_FRAMES  # numbers for each frame make wrong cameras fit
+    plain = best is None or best.name in OF_FRAMES  # with parameters for each frame even wrong cameras fit
     fit = case.null if plain else case.fits.get(best.name, case.null)
     more = [] if near else list(finite_distance(case, fit))
     more += axes_and_eyes(case, fit, -1.0 if turned else 1.0)
-    if best is not None:  # a fault of some size may skew the pixels; the next check tells
+    if best is not None:  # a large fault may also skew the pixels; a check after its cure shows
         after = _OF_PIXELS if best.explained > _MOSTLY else _OF_PIXELS[1:]
         more = [replace(h, gain=min(h.gain, 0.9 * best.gain)) if h.name in after else h for h in more]
     found += [h for h in more if np.isfinite(h.gain)]
     best = Diagnosis(found).best
-    left = _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
-    # A cause that leaves most landmarks far off is no likelier than what it leaves.
-    found = found + left if any(h.explained > _MOSTLY for h in left) else _plainest(found + left)
+    rest = _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
+    # If the best cause leaves most landmarks far off, it is not preferred for being simpler.
+    found = found + rest if any(h.explained > _MOSTLY for h in rest) else _prefer_simple(found + rest)
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

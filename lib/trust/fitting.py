@@ -1,8 +1,8 @@
-"""A hypothesis about a recording's fault: affine cameras and additions, fitted under heavy-tailed noise, and its evidence.
+"""Fits of hypotheses about a recording's fault: affine cameras plus additional terms under heavy-tailed noise; the evidence.
 
-Each image's residual of a row has a bivariate Student t density whose scale and degrees of freedom are fitted too, so that
-30 % of wrong landmarks hide nothing.  Landmarks may have constant offsets in the tool's axes, and the cameras a finite
-distance, both with a prior: whatever else is wrong, every microscope has these.
+The residual of a row in one image has a bivariate Student t density.  Its scale and degrees of freedom are fitted as well, so
+that a fault shows even if 30 % of the landmarks are wrong.  All fits include constant offsets of the landmarks in the tool's
+axes and a finite working distance, both with a prior, because every microscope has these, whatever else is wrong.
 """
 
 from collections.abc import Callable
@@ -24,30 +24,30 @@ from lib.geometry import cross
 from lib.recordings import Kinematics
 
 SIDES = ("left", "right")
-#: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
+#: Degrees of freedom that are tried: heavier tails than the bivariate Cauchy's (1) to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
-HOPELESS = 20.0  # a fit whose samples are so much less likely (log) than "nothing is wrong" never beats it
-_LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
-FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
-_LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a robot for eye surgery errs by less, and by less than so often what is stated
-_NEARLY_SHUT, _OF_SHUT = 0.15, 3.0  # jaws that open less, of the tool's length, and by how much more noise these have
-_LEAST_PX = 0.02  # smaller residuals are rounding
-_TRIED = 6  # rounds of a fit that tells which frame is better
+HOPELESS = 20.0  # fits that start with a log likelihood this far below that of "nothing is wrong" never beat it
+_LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # least gain of a hypothesis that is named, and least share that it explains
+FITS = 0.03  # scale of the residuals over the spread of the pixels, below which the cameras fit
+_LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a good robot errs by less than this, or this multiple of its stated accuracy
+_NEARLY_SHUT, _SHUT_NOISE = 0.15, 3.0  # opening of nearly shut jaws, as a share of the tool's length; factor on their noise
+_LEAST_PX = 0.02  # smaller residuals are rounding errors
+_TRIAL_ROUNDS = 6  # rounds of a fit that only ranks candidate frames
 _BLOCK = 8  # frames over which residuals may be correlated
-_LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
-_PARAMETERS = 21  # of two cameras with a distance, and about as many of the nine offsets as data tell
+_LONGEST_S = 0.25  # longest step between frames whose positions can replace the robot's log
+_PARAMETERS = 21  # two cameras with one distance (17), and about as many of the nine offsets as the data determine
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A bivariate t: scale s in px and degrees of freedom."""
+    """A bivariate Student t density: its scale in px and its degrees of freedom."""
 
     scale: float
     freedom: float
 
     @classmethod
     def of(cls, r2: np.ndarray, least: float, before: Self | None = None) -> tuple[Self, float]:
-        """Most probable for squared residuals (k,), of `least` freedom or more, near that `before`; its log likelihood."""
+        """Likeliest shape for squared residuals (k,), near `before`, with freedom >= `least`; and its log likelihood."""
         tried = _FREEDOM[least <= _FREEDOM]
         if before:
             tried = tried[np.abs(np.arange(len(tried)) - tried.searchsorted(before.freedom)) <= 1]
@@ -60,7 +60,7 @@ class Shape:
         return cls(float(np.sqrt(s2[best, 0])), float(freedom[best, 0])), float(likelihood[best])
 
     def log_density(self, r2: np.ndarray) -> np.ndarray:
-        """Of squared residuals.
+        """Log density of residuals, given their squares (px^2).
 
         >>> bool(np.isclose(Shape(1.0, 4.0).log_density(np.zeros(1))[0], -np.log(2 * np.pi)))
         True
@@ -71,48 +71,46 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Robust:
-    """The fit of a problem."""
+    """The robust fit of a `Problem`; axes of length 2 are left and right image, then x and y."""
 
     start: np.ndarray  # (26,) cameras, offsets and 1/distance, from which another fit may start
-    M: np.ndarray  # (2, 2, 4) cameras on centred positions
-    theta: np.ndarray  # (k,) additions, their covariance, and by how much they move the pixels, (n, 2, 2) px
-    covariance: np.ndarray
-    moved_px: np.ndarray
-    offsets: np.ndarray  # (3, 3) mm of the landmarks, and (3,) their deviations
-    offset_sd: np.ndarray
-    nearness: tuple[float, float]  # 1/distance, per mm, and its deviation
-    camera_covariance: np.ndarray
+    M: np.ndarray  # (2, 2, 4) cameras for positions relative to `Problem.centre`
+    theta: np.ndarray  # (k,) coefficients of the additional terms
+    covariance: np.ndarray  # (k, k) of theta
+    moved_px: np.ndarray  # (n, 2, 2) shift of the pixels by the additional terms
+    offsets: np.ndarray  # (3, 3) mm of the landmarks in the tool's axes
+    offset_sd: np.ndarray  # (3,) mm, their standard deviations, all axes together
+    nearness: tuple[float, float]  # 1/distance, per mm, and its standard deviation
+    camera_covariance: np.ndarray  # (16, 16) of M
     residuals: np.ndarray  # (n, 2, 2) px
-    apart: np.ndarray  # (n,) bool: rows of another noise
-    shapes: tuple[Shape, ...]
-    total: float  # log likelihood with the priors of offsets and distance
-    design: float  # by how much correlated rows overstate what they tell
+    apart: np.ndarray  # (n,) bool: rows whose noise has a shape of its own
+    shapes: tuple[Shape, ...]  # of the noise: of the usual rows, then of those `apart`
+    total: float  # log likelihood plus log priors of offsets and distance
+    design: float  # design effect: rows count as this many times fewer, since their errors are correlated
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Rows of a recording as the fits take them."""
+    """The rows of a recording that are fitted."""
 
-    x: np.ndarray  # (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`
+    x: np.ndarray  # (n, 2, 3) mm, the robot's positions for the left and for the right image, relative to `centre`
     y: np.ndarray  # (n, 2, 2) px
     seen: np.ndarray  # (n, 2) bool
-    noise: np.ndarray  # (n, 2) relative, from the detector's covariances; 1 on average
-    stated_px: np.ndarray  # (n, 2) RMS distance by which the detector says that it errs; 0 where it says nothing
+    noise: np.ndarray  # (n, 2) relative standard deviation by the detector's covariances; about 1
+    stated_px: np.ndarray  # (n, 2) RMS distance error that the detector states; 0 where it states none
     axes: np.ndarray  # (n, 3, 3) of the tool, 0 where unknown
-    frame: np.ndarray  # (n,) counted from 0 in their order
-    number: np.ndarray  # (frames,) of these in the recording
-    landmark: np.ndarray
-    time: np.ndarray
-    centre: np.ndarray
+    frame: np.ndarray  # (n,) index of the row's frame among those that are fitted
+    number: np.ndarray  # (frames,) number of each such frame in the recording
+    landmark: np.ndarray  # (n,)
+    time: np.ndarray  # (n,) s, video clock
+    centre: np.ndarray  # (3,) mm, the median position
     centre_px: np.ndarray  # (2,) of the images
-    offset_sd: float = 0.1  # mm, before the data: a robot's tool calibration errs, and a detector marks a place beside it
-    nearness_sd: float = 0.006  # of 1/distance, per mm, before the data: a microscope stands 150 mm away and more
+    offset_sd: float = 0.1  # mm, prior: a robot's tool calibration errs, and a detector marks a point beside the landmark
+    nearness_sd: float = 0.006  # per mm, prior of 1/distance: a microscope stands 150 mm away or more
 
     @classmethod
-    def of(
-        cls, data: Correspondences, size: tuple[int, int] | None = None, offsets: LandmarkOffsets | None = None
-    ) -> Self:  # fmt: skip
-        """The rows that the robot reports and an image, of `size` (width, height) px, shows; `offsets` may turn the axes."""
+    def of(cls, data: Correspondences, size: tuple[int, int] | None = None, offsets: LandmarkOffsets | None = None) -> Self:
+        """The rows that the robot reports and an image of `size` (width, height) px shows; `offsets` may turn the axes."""
         rows = np.isfinite(data.x_mm).all(axis=1) & data.seen.any(axis=1)
         axes = np.nan_to_num(rows_axes(data, offsets.offset if offsets and offsets.turns else None))[rows]
         data = data.subset(rows)
@@ -121,11 +119,11 @@ class Problem:
             noise = np.sqrt(variance / np.nanmedian(variance)) if np.isfinite(variance).any() else variance
         noise = np.clip(np.where(np.isfinite(noise), noise, 1.0), 0.5, 4.0)
         number, frame = np.unique(data.frame, return_inverse=True)
-        if axes.any():  # offsets turn those of jaws that are nearly shut
+        if axes.any():  # offsets turn the axes of nearly shut jaws, which adds errors
             tool = data.grid("x_mm")
             opening, length = tool[:, 2] - tool[:, 1], (tool[:, 1] + tool[:, 2]) / 2 - tool[:, 0]
             shut = np.linalg.norm(opening, axis=1) < _NEARLY_SHUT * np.linalg.norm(length, axis=1)
-            noise *= np.where(shut, _OF_SHUT, 1.0)[frame, None]
+            noise *= np.where(shut, _SHUT_NOISE, 1.0)[frame, None]
             noise /= np.median(noise)
         centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
         y = np.stack([data.u_left, data.u_right], axis=1)
@@ -143,27 +141,28 @@ class Problem:
         return self.seen & np.isfinite(self.x).all(axis=2)
 
     def claimed_px(self, rows: np.ndarray | slice = slice(None)) -> float:
-        """The distance by which the detector says that it errs, the median of rows; 0 where it says nothing."""
+        """Median distance error of some rows, px, as the detector states it; 0 if it states none."""
         return float(np.nanmedian(np.append(self.stated_px[rows], 0.0)))
 
     def fit(
         self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40, worth: float = -np.inf,
     ) -> Robust:  # fmt: skip
-        """Most probable cameras, offsets and additions, near a `Robust.start` or the best sample of four rows.
+        """Fit cameras, offsets and the coefficients of additional terms (maximum a posteriori).
 
-        `columns` (n, 2, 2, k) (or cameras M -> columns): what each addition does to pixels; rows `apart` have another noise.
-        Samples whose log likelihood stays below `worth` are not followed to the end.
+        `columns` (n, 2, 2, k) are derivatives of the pixels by the coefficients, or a function of the cameras M that gives
+        them; rows `apart` have noise of their own.  Without `start` (a `Robust.start`), least squares and the best sample of
+        four rows are tried, and the better one is returned unfinished if its log likelihood is below `worth`.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
-        if start is None:  # of least squares, or of the samples of four rows that most rows are near to
+        if start is None:
             starts, rng = np.zeros((2, 26)), np.random.default_rng(0)
             cameras = starts[:, :16].reshape(2, 2, 2, 4)
             for view, rows in enumerate(self.used.T):
                 if rows.sum() >= 4:
                     x, y = self.x[rows, view], self.y[rows, view]
                     cameras[0, view] = regress(x, y)
-                    with suppress(ValueError):  # positions in one plane
+                    with suppress(ValueError):  # the positions lie in one plane
                         cameras[1, view] = tightest_sample(x, y, rng)
             best = max((self._descend(beta, columns, apart, 8) for beta in starts), key=lambda fit: fit.total)
             if best.total < worth:
@@ -172,65 +171,65 @@ class Problem:
         return self._descend(start, columns, apart, rounds)
 
     def of_later_cameras(self, frame: int, views: tuple[int, ...] = (0, 1)) -> np.ndarray:
-        """(n, 2, 2, 8 a view): derivatives by what the entries of some cameras change by at a frame."""
+        """(n, 2, 2, 8 per view): derivatives of the pixels by a change of the cameras of `views` from `frame` on."""
         late = np.where((self.frame >= frame)[:, None, None, None, None, None], self.of_cameras[:, :, :, views], 0.0)
         return late.reshape(len(self), 2, 2, -1)
 
     def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """`columns` of a turn about and a shift along x, y and z, by a `share` (n,) of them, of all landmarks together."""
+        """`columns` of `fit` for a turn and a shift of all landmarks together (6 numbers), scaled by `share` (n,) of rows."""
         turns, shifts = cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
         moves = share[:, None, None, None] * np.concatenate([turns, shifts], axis=2)
         return lambda M: np.einsum("cij,nckj->ncik", M[:, :, :3], moves)
 
     def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
-        """The frame from which on cameras of their own suit the rows best, and the fit with them, from a `fit` without.
+        """The frame at which a change of cameras explains the rows best, and the fit with that change.
 
-        Weighted least squares of all cuts tell where to begin; fits of few rounds compare the frames around it.
+        `fit` has no such change.  Weighted least squares over all cuts find a first guess; short fits then search around it.
         """
         z = np.nan_to_num(np.concatenate([self.x, np.ones((len(self), 2, 1)), fit.residuals], axis=2))
         frames, scale = int(self.frame.max()) + 1, fit.shapes[0].scale
         weight = np.where(self.used, 1.0 / (scale**2 + scale * np.linalg.norm(fit.residuals, axis=2)), 0.0)
-        moments, left = np.zeros((frames, 2, 6, 6)), 0.0
+        moments, remaining = np.zeros((frames, 2, 6, 6)), 0.0
         np.add.at(moments, self.frame, np.einsum("nc,nci,ncj->ncij", weight, z, z))
         early = np.cumsum(moments, axis=0)[1:-2]
-        for part in (early, moments.sum(axis=0) - early):  # what cameras of its own leave of it
+        for part in (early, moments.sum(axis=0) - early):  # remaining squares, with cameras of each part's own
             G = part[..., :4, :4] + 1e-9 * np.trace(part, axis1=2, axis2=3)[..., None, None] * np.eye(4) + 1e-12 * np.eye(4)
-            open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
-            left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
+            schur = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
+            remaining = remaining + np.trace(schur, axis1=2, axis2=3).sum(axis=1)
 
         @cache
-        def parted(frame: int) -> Robust:
-            return self.fit(self.of_later_cameras(frame), start=fit.start, rounds=_TRIED)
+        def cut_at(frame: int) -> Robust:
+            return self.fit(self.of_later_cameras(frame), start=fit.start, rounds=_TRIAL_ROUNDS)
 
-        cut, step = int(left.argmin()) + 2, max(frames // 5, 1)
+        cut, step = int(remaining.argmin()) + 2, max(frames // 5, 1)
         while step:
-            best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
+            best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: cut_at(frame).total)
             step, cut = step if best != cut else step // 2, best
-        return cut, self.fit(self.of_later_cameras(cut), start=parted(cut).start)
+        return cut, self.fit(self.of_later_cameras(cut), start=cut_at(cut).start)
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
-        """(..., n, 2, 2) px: what the cameras of a fit leave of the pixels at other positions x (..., n, 2, 3)."""
-        seen = np.einsum("cij,...cj->...ci", fit.M[:, :, :3], x) + fit.M[:, :, 3]
-        return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
+        """(..., n, 2, 2) px: the residuals with the cameras of a fit, if the landmarks were at positions x (..., n, 2, 3)."""
+        affine = np.einsum("cij,...cj->...ci", fit.M[:, :, :3], x) + fit.M[:, :, 3]
+        return self.y - affine - fit.nearness[0] * _by_nearness(fit.M, x, affine - self.centre_px)
 
     @cached_property
     def of_cameras(self) -> np.ndarray:
-        """(n, 2, 2, 2, 2, 4): derivatives by the entries of the cameras (2, 2, 4), 0 in images that are not used."""
+        """(n, 2, 2, 2, 2, 4): derivatives of the pixels by the entries of the cameras (2, 2, 4); 0 in unused images."""
         H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2))
 
     @cached_property
     def _of_offsets(self) -> np.ndarray:
-        """(2, 3, n * 9): derivatives of the positions by the offsets, 0 in images that are not used."""
+        """(2, 3, n * 9): derivatives of the positions by the offsets; 0 in unused images."""
         own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
         return np.einsum("nij,nck->cinkj", self.axes, own).reshape(2, 3, -1)
 
     def _design(self, M: np.ndarray, columns: np.ndarray | Callable | None) -> np.ndarray:
-        """(n * 4, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
+        """(n * 4, p): derivatives of the pixels by M (16), the offsets (9), 1/distance, `columns`; 0 in unused images."""
         of_offsets = (M[:, :, :3] @ self._of_offsets).reshape(2, 2, -1, 9).transpose(2, 0, 1, 3)
         of_cameras, used = self.of_cameras.reshape(-1, 16), self.used[:, :, None]
-        shrinking = _shrinking(M, self.x, (of_cameras @ M.ravel()).reshape(self.y.shape) - self.centre_px)
-        parts = [of_cameras.reshape(*self.y.shape, 16), of_offsets, np.where(used, shrinking, 0.0)[..., None]]
+        of_nearness = _by_nearness(M, self.x, (of_cameras @ M.ravel()).reshape(self.y.shape) - self.centre_px)
+        parts = [of_cameras.reshape(*self.y.shape, 16), of_offsets, np.where(used, of_nearness, 0.0)[..., None]]
         parts += [] if columns is None else [np.nan_to_num(columns(M) if callable(columns) else columns) * used[..., None]]
         return np.concatenate(parts, axis=3).reshape(self.y.size, -1)
 
@@ -242,9 +241,9 @@ class Problem:
         prior = np.diag(np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2, 0.0], [16, 9, 1, D.shape[1] - 26]))
         r = y - (D[:, :26] @ beta).reshape(y.shape)
         r2 = (r**2).sum(axis=2) / self.noise**2
-        # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
-        rich = 2 * used.sum() / (_PARAMETERS + D.shape[1] - 26)
-        least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
+        # With few numbers per parameter, a density with a sharp peak would fit some rows exactly.
+        numbers = 2 * used.sum() / (_PARAMETERS + D.shape[1] - 26)  # per parameter
+        least = 0.0 if numbers > 10 else 2.0 if numbers > 5 else 10.0
         found = [Shape.of(r2[rows], least) for rows in groups]
         before, of_noise = -np.inf, -2.0 * np.log(self.noise[used]).sum()
         for done in range(rounds):
@@ -255,7 +254,7 @@ class Problem:
             root = (np.sqrt(weight) / self.noise)[:, :, None]
             J = D * np.repeat(root, 2)[:, None]
             information = J.T @ J + prior
-            np.fill_diagonal(information, np.diag(information) * (1.0 + 1e-10) + 1e-22)  # an unseen addition stays 0
+            np.fill_diagonal(information, np.diag(information) * (1.0 + 1e-10) + 1e-22)  # an undetermined term stays 0
             beta = dposv(information, J.T @ (y * root).reshape(-1))[1]
             M, r = beta[:16].reshape(2, 2, 4), y - (D @ beta).reshape(y.shape)
             r2 = (r**2).sum(axis=2) / self.noise**2
@@ -264,23 +263,23 @@ class Problem:
             if abs(total - before) < 0.02:
                 break
             before = total
-        shapes, design = [shape for shape, _ in found], self._overcount(r * root)
-        told = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # by so much this exceeds Fisher's information
-        inverse = np.linalg.inv(information) * design * told
+        shapes, design = [shape for shape, _ in found], self._design_effect(r * root)
+        excess = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # ratio of `information` to the Fisher information
+        inverse = np.linalg.inv(information) * design * excess
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
         found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape), beta[16:25].reshape(3, 3), offset_sd
         return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, apart, tuple(shapes), total, design)
 
-    def _overcount(self, z: np.ndarray) -> float:
-        """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
-        stretch = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
-        sums = np.array([np.bincount(stretch, one) for one in z.sum(axis=1).T])  # (2, stretches)
+    def _design_effect(self, z: np.ndarray) -> float:
+        """Variance of the sums of weighted residuals z (n, 2, 2) over blocks of frames, relative to independent residuals."""
+        block = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
+        sums = np.array([np.bincount(block, one) for one in z.sum(axis=1).T])  # (2, blocks)
         return float(max(1.0, ((sums**2).sum(axis=1) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
 
 
-def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
-    """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels `from_centre` of the image, of positions x (..., n, 2, 3)."""
+def _by_nearness(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
+    """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels, given `from_centre`, of positions x (..., n, 2, 3)."""
     normal = cross(M[:, 0, :3], M[:, 1, :3])
     normal /= -np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-12)
     return np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre
@@ -288,7 +287,7 @@ def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault: what the residuals look like, the setting or call that mends it, its size, the images it is in."""
+    """A possible fault: its description, the setting or call that mends it, its size, and the images in which it is."""
 
     name: str
     text: str
@@ -296,23 +295,23 @@ class Hypothesis:
     value: float
     sd: float
     unit: str
-    explained: float  # share of the residuals' variance, 0 to 1, by likelihood; how sure or large where they do not show it
-    gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
+    explained: float  # share of the residuals' variance, 0 to 1; how sure or large the fault is where residuals hide it
+    gain: float  # log likelihood above that of "nothing is wrong", minus the penalty for its parameters
     images: tuple[int, ...] = (0, 1)  # left and right
-    evidence: tuple[float, float, float, float] | None = None  # of the fit that the gain is of, as `_gain` takes it
+    evidence: tuple[float, float, float, float] | None = None  # arguments of `_gain`, if a fit gave the gain
 
     @property
     def is_named(self) -> bool:
-        """Whether it beats "nothing is wrong"."""
+        """True if it beats "nothing is wrong"."""
         return self.gain >= _LEAST_GAIN and self.explained >= _LEAST_EXPLAINED
 
 
 class Case:
-    """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
+    """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and data that the hypotheses share.
 
-    `paths` are the landmarks' in time: of the robot's log, else of the rows where the frames follow each other closely, else
-    None.  `log` (m, k, 3) has the robot's positions, else the rows'.  `size` is (width, height) or None; `frames` a number.
-    A robot that errs by more than `robot_mm` is no good one.
+    `paths` are the landmarks' trajectories by the robot's log, or by the rows if frames follow each other closely, or None.
+    `log` (m, k, 3) mm are the positions in the robot's log, or in the rows.  `size` is (width, height) px or None, `frames`
+    the number of frames.  A robot that errs by more than `robot_mm` is at fault.
     """
 
     def __init__(
@@ -339,20 +338,20 @@ class Case:
             self._clock_s = 0.0
 
     def misfit(self, *fits: Robust) -> float:
-        """The scale of the residuals over the spread of the pixels, of the best of some fits."""
+        """Scale of the residuals, relative to the standard deviation of the pixels, in the best of some fits."""
         return min(fit.shapes[0].scale for fit in fits) / self.problem.y[self.problem.used].std(axis=0).max()
 
     def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
-        """(..., n, 3) mm: the positions of the rows `shift_s` later, a number or (..., n); NaN where nothing tells."""
+        """(..., n, 3) mm: the positions of the rows `shift_s` later, a number or (..., n); NaN where they are unknown."""
         landmark, now = self.problem.landmark, self.problem.time + self._clock_s
         return self.problem.x[:, 0] + self.paths.at(landmark, now + shift_s) - self.paths.at(landmark, now)
 
     def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
-        """(n, 3) mm/s of the rows, `shift_s` later."""
+        """(n, 3) mm/s: the velocities of the rows' landmarks, `shift_s` later."""
         return self.paths.at(self.problem.landmark, self.problem.time + self._clock_s + shift_s, 1)
 
     def smooth_axes(self) -> np.ndarray:
-        """The tool's axes (n, 3, 3) by its smoothed path, at each row's instant: noise and some ms turn a long lever far."""
+        """The tool's axes (n, 3, 3) on its smoothed path: along a long lever noise, or a few ms, would move a point far."""
         axes, now = self.problem.axes, self.problem.time + self._clock_s
         if self.paths is None or len(self.paths.pieces) < 3:
             return axes
@@ -360,13 +359,13 @@ class Case:
         return np.where(np.isfinite(own), own, axes)
 
     def by_frame(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, ...) of the rows as (frames, 3, ...), NaN where a landmark is missing."""
+        """Values (n, ...) of the rows as a table (frames, 3, ...), NaN where a landmark is missing."""
         table, rows = np.full((self.frames, 3, *values.shape[1:]), np.nan), self.problem.landmark <= 2
         table[self.problem.frame[rows], self.problem.landmark[rows]] = values[rows]
         return table
 
     def chosen(self, x: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray]:
-        """Each frame, in some images, with its best of positions x (t, n, 3): the fit, its rows, the choices (frames,)."""
+        """The fit with the best of positions x (t, n, 3) for each frame, in `views`; its rows; the choices (frames,)."""
         problem, fit, own = self.problem, self.null, np.full(self.frames, -1)
         for _ in range(5):
             r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
@@ -382,14 +381,14 @@ class Case:
         return fit, moved, own
 
     def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None) -> Robust:
-        """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns)."""
+        """The fit with additional `columns`, as `Problem.fit` takes them."""
         return (on or self.problem).fit(columns, start=self.null.start)
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
         on: Problem | None = None, raw: float | None = None, images: tuple[int, ...] = (0, 1),
     ) -> Hypothesis:  # fmt: skip
-        """With the evidence of its fit, which has `extra` parameters more than "nothing is wrong" on the rows of `on`."""
+        """The hypothesis with its evidence.  `fit`, on the rows of `on`, has `extra` more parameters than `null`."""
         null = self.null
         if on is not None and (on.used != self.problem.used).any():
             null = replace(self.problem, seen=on.used).fit(start=null.start)
@@ -403,10 +402,10 @@ class Case:
 
 
 def compared(found: list[Hypothesis], of_frames: tuple[str, ...] = ()) -> list[Hypothesis]:
-    """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs.
+    """Make the gains comparable: all hypotheses that are named use the smallest design effect among them.
 
-    So they do for causes of one or two numbers: what is left may be in stretches, by which its own rows hardly count.  Those
-    named in `of_frames`, with numbers for each frame, leave no stretches whatever is wrong; they take the others' design.
+    So do causes of one or two parameters: where other faults remain, their own design effect is too large.  Causes named in
+    `of_frames`, with parameters for each frame, leave white residuals whatever is wrong; they use the others' design effect.
     """
     designs = [h.evidence[3] for h in found if h.is_named and h.name not in of_frames]
     least, gains = min(designs, default=np.inf), []
@@ -422,7 +421,7 @@ def compared(found: list[Hypothesis], of_frames: tuple[str, ...] = ()) -> list[H
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:
-    """Log likelihood `raw` of n numbers, overstated by `design`, less what `extra` parameters of few rows gain by chance."""
+    """Gain `raw` in log likelihood of n numbers, divided by `design`, minus the chance gain of `extra` parameters (BIC)."""
     freedom = n / design - _PARAMETERS
     left = freedom - extra
     return float(left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)) if left >= 4 else -np.inf

@@ -1,7 +1,7 @@
-"""The health of the detector without labels: where what it found contradicts itself, the other image or the robot.
+"""The health of the detector without labels: where its detections contradict each other, the other image or the robot.
 
-A network that does not know a picture answers anew when the picture is mirrored or shifted; one that knows it answers the
-same.  And pictures whose colours and details are unlike those of the training are unfamiliar, whatever the answer.
+A network that does not know a picture gives different landmarks when the picture is mirrored or shifted; one that knows it
+gives the same.  Pictures whose colours and details are unlike the training pictures are unfamiliar, whatever is detected.
 """
 
 import warnings
@@ -19,47 +19,47 @@ from lib.correspondences import Correspondences
 from lib.landmarks import with_ground
 from lib.recordings import Recording
 
-#: What a landmark of a frame may show of each part; see `Health.false_alarm_rate`.
+#: Part of the score -> limit for a landmark of a frame; see `Health.false_alarm_rate`.
 LIMITS = {
-    "looks": 0.02,  # the same frame mirrored and shifted: largest move of the landmark, of the tool's length
-    "epipolar": 0.03,  # distance of left and right from one epipolar geometry, of the tool's length
-    "robot": 8.0,  # distance from where the robot says, in RMS residuals of the calibration (at least 1 px)
-    "smoothness": 0.05,  # the same less what the frames before and after have, of the tool's length
-    "shape": 0.2,  # triangulated length of the tool, relative to the robot's; of a frame, not of a landmark
-    # RMS of the picture's `looks` in standard deviations of training; of a frame.  2 % of 96 validation pictures exceed it.
+    "looks": 0.02,  # largest shift of the landmark when the frame is mirrored or shifted, as a share of the tool's length
+    "epipolar": 0.03,  # distance of left and right from a common epipolar geometry, as a share of the tool's length
+    "robot": 8.0,  # distance from the robot's report, over the RMS residual of the calibration (at least 1 px)
+    "smoothness": 0.05,  # change of that distance vector from the frames before and after, as a share of the tool's length
+    "shape": 0.2,  # relative error of the tool's triangulated length by the robot's; of a frame, not of a landmark
+    # Of a frame: RMS z-score of the image features of `unfamiliar`.  2 % of 96 validation pictures exceed it.
     "unfamiliar": 2.1,
 }
-#: Parts that are of a frame: they tell no wrong landmark.
+#: Parts that belong to a frame and show no wrong landmark.
 _OF_FRAMES = ("shape", "unfamiliar")
-#: Parts that take the robot's report for right.
+#: Parts that assume that the robot's report is right.
 _BY_ROBOT = ("robot", "smoothness", "shape")
-#: Medians and standard deviations of `looks` over 288 pictures of the training population.
+#: Medians and standard deviations of the image features of `unfamiliar` over 288 pictures of the training population.
 _FAMILIAR = np.array([
     [0.32, -0.23, -2.49, -2.54, -0.76, -1.80, -3.38, -2.91, -2.76], [0.32, 0.31, 0.82, 0.82, 0.47, 0.52, 0.66, 0.60, 0.59],
 ])  # fmt: skip
-_WIDTH_PX = 240  # of a picture whose looks are taken
-_LOOKS, _PICTURES = 12, 60  # frames looked at again; pictures compared with those of the training
+_WIDTH_PX = 240  # width to which a picture is reduced for `unfamiliar`
+_LOOKS, _PICTURES = 12, 60  # frames detected again, mirrored and shifted; pictures compared with those of the training
 #: Frames further apart in time are not compared for smoothness.
 _NEXT_S = 0.15
 _MIRRORED = partial(np.flip, axis=2)
-_TAILS = 3.0  # most that the RMS of residuals is above their median, gross errors aside
-#: By how much a look is shifted, (x, y) px: no multiple of a network's stride.
+_TAILS = 3.0  # largest ratio of the RMS of residuals to their median without gross errors
+#: Shift of an image that is detected again, (x, y) px: no multiple of a network's stride.
 _SHIFT_PX = (37, 21)
-#: The images are halved: features of the retina are larger than a pixel, and it takes a quarter of the time.
+#: Images are matched at half size: features of the retina are larger than a pixel, and it takes a quarter of the time.
 _HALVED = 2
 _RATIO = 0.8  # Lowe's ratio test
-_OVERLAY_PX = 2.0  # what lies nearer to the same place in both images is text or a mark that a recorder wrote there
-_FEWEST = 20  # matches that agree, below which a frame is no witness
-_AGREE_PX = 4.0  # median distance of these from their own geometry, above which they are matched by chance: a pattern repeats
+_OVERLAY_PX = 2.0  # a feature with less disparity is text or a mark that a recorder wrote into both images
+_FEWEST = 20  # least number of agreeing matches in a frame that is used
+_AGREE_PX = 4.0  # largest median distance of these from their geometry; beyond it matches are accidental, as in a pattern
 
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """What contradicts itself, for each landmark, and one number a frame.
+    """How consistent each landmark is with other evidence, and one score for each frame.
 
     Attributes:
-        frame, seen: (m,) numbers of the frames, and (m, 3) bool: found in one image or both.
-        parts: Name -> (m, 3) in units of its limit, the worse of the two images; NaN where a landmark does not have it.
+        frame, seen: (m,) numbers of the frames, and (m, 3) bool: found in at least one image.
+        parts: Name -> (m, 3) in units of its limit, the worse of the two images; NaN where it could not be computed.
         false_alarm_rate: Upper bound of the share of frames with right landmarks (all within 5 % of the tool's length) whose
             score exceeds 1: 3 of 35 frames of the validation population without `unfamiliar`, and the 2 % that this may add.
     """
@@ -71,12 +71,12 @@ class Health:
 
     @property
     def score(self) -> np.ndarray:
-        """(m,) the worst part of the worst landmark; above 1 the frame is not to be believed, NaN where nothing is seen."""
+        """(m,) the worst part of the worst landmark; above 1 the frame is in doubt; NaN where no part could be computed."""
         return np.fmax.reduce([np.fmax.reduce(part, axis=1) for part in self.parts.values()])
 
     @property
     def bad(self) -> np.ndarray:
-        """(m, 3) bool: seen, and one of its own parts exceeds the limit."""
+        """(m, 3) bool: seen, and a part of the landmark itself exceeds its limit."""
         return self.seen & np.any([part > 1 for name, part in self.parts.items() if name not in _OF_FRAMES], axis=0)
 
     @property
@@ -86,17 +86,17 @@ class Health:
 
     @property
     def worst_part(self) -> str:
-        """The part that most landmarks fail of themselves."""
+        """The part whose limit most landmarks exceed, without the parts of whole frames."""
         return max((n for n in self.parts if n not in _OF_FRAMES), key=lambda name: np.sum(self.parts[name] > 1))
 
     @property
     def without_robot(self) -> Self:
-        """The same without the parts that take the robot's report for right."""
+        """The same without the parts that assume that the robot's report is right."""
         return replace(self, parts={name: part for name, part in self.parts.items() if name not in _BY_ROBOT})
 
     @property
     def text(self) -> str:
-        """What is unhealthy, in words without a full stop."""
+        """The share of bad landmarks, in words without a full stop."""
         if not self.seen.any():
             return "No frame has a landmark"
         what = "themselves, the other image or the robot" if "robot" in self.parts else "themselves or the other image"
@@ -107,16 +107,16 @@ def health(
     recording: Recording | None, data: Correspondences, calibration: Calibration | None = None, *,
     detector: Callable | None = None,
 ) -> Health:  # fmt: skip
-    """Compare what the detector found, `data`, with everything that is known without labels; ValueError if it found no row.
+    """Compare the detections `data` with everything that is known without labels; ValueError if `data` has no row.
 
-    The calibration is made from `data`, and the detector looks again at some frames, mirrored and shifted.  Without
-    recording, calibration or detector, what needs it is left out.
+    `calibration` was made from `data`.  `detector` detects again in some frames, mirrored and shifted.  Parts that need a
+    recording, calibration or detector that is None are left out.
     """
     if not len(data):
         raise ValueError("data: no row; run the detector over some frames.")
     frame = np.unique(data.frame)
     u = data.grid("stacked_px").reshape(len(frame), -1, 2, 2)  # (m, 3, 2, 2)
-    with warnings.catch_warnings(action="ignore"):  # means of what no frame shows
+    with warnings.catch_warnings(action="ignore"):  # means of all-NaN slices
         length = np.nanmedian(np.linalg.norm(u[:, 1:] - u[:, :1], axis=-1))
         time = np.nanmean(data.grid("time_s"), axis=1)
     shape, y = u.shape[:2], u.reshape(-1, 4)
@@ -124,12 +124,12 @@ def health(
     if calibration is not None and calibration.rig is not None:
         rig, x = calibration.rig, with_offsets(data, calibration.offsets).grid("x_mm")
         off = u - np.hstack(rig.project(x.reshape(-1, 3))).reshape(u.shape)
-        # Off the median of a frame and its two neighbours, where these are close in time.
+        # Deviation from the median of a frame and its two neighbours, if these are close in time.
         jump = np.full(off.shape, np.nan)
         near = (time[2:] - time[:-2] <= 2 * _NEXT_S)[:, None, None, None]
         jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
-        distance, jump = (np.fmax.reduce(np.linalg.norm(one, axis=-1), axis=2) for one in (off, jump))  # of the worse image
-        usual = min(calibration.reprojection_rms_px, _TAILS * np.nanmedian(distance))  # few gross errors hide no others
+        distance, jump = (np.fmax.reduce(np.linalg.norm(one, axis=-1), axis=2) for one in (off, jump))  # in the worse image
+        usual = min(calibration.reprojection_rms_px, _TAILS * np.nanmedian(distance))  # gross errors must not hide others
         parts["robot"] = distance / max(usual, 1.0)
         parts["smoothness"] = jump / length
         seen = rig.triangulate(y[:, :2], y[:, 2:]).x_mm.reshape(x.shape)
@@ -145,14 +145,14 @@ def health(
 
 
 def spread(n: int, count: int) -> np.ndarray:
-    """At most `count` of n numbers, evenly."""
+    """At most `count` of the numbers 0 to n - 1, evenly spaced."""
     return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(int))
 
 
 def unfamiliar(image: np.ndarray) -> float:
-    """How unlike the pictures of the training an image (h, w, 3) uint8 RGB is: RMS over its looks, in their deviations.
+    """How unlike the training pictures an image (h, w, 3) uint8 RGB is: the RMS of its features' z-scores.
 
-    Its looks are medians and spreads of its colours, its brightness, its contrast, and that of three sizes of detail.
+    The features are medians and spreads of the colours, brightness, contrast, and the contrast of three sizes of detail.
     """
     size = _WIDTH_PX, max(8, round(_WIDTH_PX * image.shape[0] / image.shape[1]))
     log = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255 + 0.02)
@@ -160,12 +160,12 @@ def unfamiliar(image: np.ndarray) -> float:
     blurred = [grey, *(cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 4, 16))]
     detail = [np.std(fine - coarse) + 1e-3 for fine, coarse in pairwise(blurred)]
     spread = np.log([*(chroma.std(axis=(0, 1)) + 3e-3), grey.std() + 1e-6, *detail])
-    looks = np.array([*np.median(chroma, axis=(0, 1)), *spread[:2], grey.mean(), *spread[2:]])
-    return float(np.sqrt((((looks - _FAMILIAR[0]) / _FAMILIAR[1]) ** 2).mean()))
+    features = np.array([*np.median(chroma, axis=(0, 1)), *spread[:2], grey.mean(), *spread[2:]])
+    return float(np.sqrt((((features - _FAMILIAR[0]) / _FAMILIAR[1]) ** 2).mean()))
 
 
 def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable) -> np.ndarray:
-    """(m, 3, 2) px how far a mirrored and a shifted look move a landmark; infinite where they disagree that it is there."""
+    """(m, 3, 2) px: largest shift of each landmark in a mirrored and a shifted image; infinite where it is lost there."""
     moved = np.full(u.shape[:3], np.nan)
     for i in spread(len(frame), _LOOKS):
         pair = recording.frames[int(frame[i])]
@@ -183,9 +183,9 @@ def _shifted(images: np.ndarray) -> np.ndarray:
 
 
 def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n,) px of matches y (n, 4) from the affine epipolar geometry that most share, and which (n,) agree.
+    """Distances (n,) px of matches y (n, 4) from the affine epipolar geometry of most of them, and (n,) bool which agree.
 
-    Least median of squares, then a refit; NaN rows stay NaN, all of them are where fewer than 12 are known.
+    Least median of squares, then a refit.  Distances of NaN rows are NaN; with fewer than 12 finite rows all are.
     """
     rows = np.flatnonzero(np.isfinite(y).all(axis=1))
     found, agree = np.full(len(y), np.nan), np.zeros(len(y), dtype=bool)
@@ -206,7 +206,7 @@ def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
-    """Features (n, 4) px matched freely between left and right; those of a frame agree on some affine epipolar geometry."""
+    """SIFT features (n, 4) px matched between left and right; those of one frame agree on some affine epipolar geometry."""
     sift, found = cv2.SIFT_create(2000), [np.zeros((0, 4))]
     for i in frames:
         pair = recording.frames[int(i)]
@@ -217,7 +217,7 @@ def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a, b, k=2)
         pairs = [best for best, second in pairs if best.distance < _RATIO * second.distance]
         times = np.bincount([m.trainIdx for m in pairs], minlength=len(b))
-        pairs = [m for m in pairs if times[m.trainIdx] == 1]  # a feature to which many match is none of theirs
+        pairs = [m for m in pairs if times[m.trainIdx] == 1]  # a feature that matches several others is ambiguous
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
         y = y[np.abs(y[:, :2] - y[:, 2:]).max(axis=1) > _OVERLAY_PX]
         distance, agree = affine_epipolar(y)

@@ -8,33 +8,33 @@ import numpy as np
 from lib.calibration.checks import eyes_exchanged, sides
 from lib.trust.fitting import FITS, Case, Hypothesis, Robust
 
-#: Standard deviations of a camera's skew and log pixel aspect.
+#: Standard deviations, before the data, of a camera's skew and of the log of its pixel aspect.
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
-#: By so much a misfit must be smaller to tell resized images from a scaled axis; the share that else counts as explained.
+#: Least difference in chi-square that decides between resized images and a scaled axis; most to be explained if undecided.
 _RATHER_RESIZED, _UNDECIDED = 9.0, 0.49
-#: Of the jaws' lengths in the log: stretches of time whose means count, and parts of time that err apart.
+#: Jaw lengths in the log: number of stretches of time that are averaged, and of parts of time with independent errors.
 _STRETCHES, _PARTS = 60, 8
-#: Least change of length^-2 by a scaled axis, also in standard deviations, and that which a good robot may have.
+#: Slope of length^-2 on n^2: the least of a scaled axis, the same in standard deviations, and that of a good robot (sd).
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
-#: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
+#: Least share of the variance that the slope explains, largest RMS that it leaves, and least RMS of n^2 as the jaws turn.
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
-_FIT_SHARE = 0.3  # of the landmarks in each image that must lie near where cameras see them, before these tell anything
-_DISTORTION_SD = 0.04  # at the corner, before the data
-_ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
-_UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
-_INDEPENDENT_HZ = 3.0  # frames that tell something new of how a tool points
-#: Stated standard deviations of 1/distance, whose sign then is known; errors that last make it 6.
+_FIT_SHARE = 0.3  # share of the landmarks of each image that must fit before the cameras are interpreted
+_DISTORTION_SD = 0.04  # prior standard deviation of the relative distortion at the corner
+_ACROSS = 0.15  # sine of the tool's angle to the image plane, below which it points neither towards the cameras nor away
+_UPSIDE_DOWN = 20.0  # odds that the tips of a tool lie below its base, as seen from the microscope
+_INDEPENDENT_HZ = 3.0  # frames per second with independent evidence of where the tool points
+#: Standard deviations of 1/distance from 0 at which its sign is certain: errors that last from frame to frame make 8 worth 6.
 SURE_CURVED = 8.0
-_CURVED_FITS = 0.01  # misfit below which 1/distance tells something
+_CURVED_FITS = 0.01  # misfit below which 1/distance can be interpreted
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
-_ODD_PIXELS = "The cameras' pixels are skewed or oblong, and no axis of the robot is to blame: the jaws keep their lengths."
+_ODD_PIXELS = "The cameras' pixels are skewed or oblong. No axis of the robot is the cause: the jaws keep their lengths."
 _STEADY = "Look for what bends, or changes while you record: shaft, microscope, clock. Resized images do no harm."
 
 
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
-    """A perspective that an affine camera has not, beside the best cause so far."""
+    """A perspective, which an affine camera lacks, in addition to the best cause so far."""
     value, sd = fit.nearness
-    if value <= 0:  # `_handedness` says what that means
+    if value <= 0:  # `_handedness` interprets that
         return
     text = f"The residuals are curved by a working distance of {1 / value:.0f} mm: "
     text += f"1/distance is {value:.5f} +- {sd:.5f} per mm."
@@ -46,9 +46,9 @@ def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
 
 
 def lens(case: Case) -> Iterator[Hypothesis]:
-    """Lenses that distort: pixels move towards the centre of the image, or away from it, by the cube of their distance."""
+    """Lenses that distort: pixels shift along the ray from the image centre, in proportion to the cube of their distance."""
     problem = case.problem
-    if case.size is None:  # nothing tells where the images' centre is
+    if case.size is None:  # the images' centre is unknown
         return
 
     def columns(M: np.ndarray) -> np.ndarray:
@@ -60,27 +60,27 @@ def lens(case: Case) -> Iterator[Hypothesis]:
     left, right = 100 * fit.theta
     where = [f"{abs(v):.1f} % too far {'out' if v > 0 else 'in'}" for v in (left, right)]
     text = f"The lenses distort: the corners of the left image lie {where[0]}, those of the right one {where[1]}."
-    cure = "`python3 -m lib calibrate RECORDING --model zero_skew+distance+radial` takes that on."
+    cure = "`python3 -m lib calibrate RECORDING --model zero_skew+distance+radial` corrects that."
     size, sd = np.abs(fit.theta).max(), np.sqrt(np.trace(fit.covariance) / 2)
     raw = fit.total - case.null.total - 0.5 * ((fit.theta / _DISTORTION_SD) ** 2).sum()
     yield case.found("lens_distortion", fit, 2, (100 * size, 100 * sd, "%"), text, cure, raw=raw)
 
 
 def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
-    """What an affine camera absorbs: the jaws, and the optics in the fit of the best cause so far, are the witnesses."""
+    """Faults that affine cameras absorb.  They show in the jaw lengths, and in the optics fitted with the best cause."""
     (A, covariance), (plain, of_plain) = (_of_axes(one, sign) for one in (fit, case.null))
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
-    # Cameras that fit nothing always have skewed pixels, one of the two, too.
+    # A camera that does not fit, even if only one of the two, always has skewed pixels.
     distance, spread = np.linalg.norm(fit.residuals, axis=2), case.problem.y[case.problem.used].std(axis=0).max()
     each = [np.quantile(own[rows], _FIT_SHARE) / spread for own, rows in zip(distance.T, case.problem.used.T, strict=True)]
     if (misfit := max(case.misfit(fit), *each)) < FITS:
-        # Pixels cannot tell x from y; and where cameras fit without that cause, their pixels must be implausible, too.
-        told = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
+        # If the cameras also fit without the best cause, their pixels must be implausible there as well.
+        implausible = case.misfit(case.null) >= FITS or any(h.is_named for h in _scaled_axis(plain, of_plain))
         accused, refuted = _jaws(case)
-        yield from accused or (_scaled_axis(A, covariance, refuted) if told else ())
-    if misfit < 2 * FITS:  # nor do they tell left from right
+        yield from accused or (_scaled_axis(A, covariance, refuted) if implausible else ())
+    if misfit < 2 * FITS:  # cameras that do not fit cannot tell left from right either
         curved = fit.nearness if misfit < _CURVED_FITS else (0.0, np.inf)
         yield from _handedness(case, A, covariance, curved)
 
@@ -92,17 +92,17 @@ def _of_axes(fit: Robust, sign: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _constraints(A: np.ndarray) -> np.ndarray:
-    """(..., 4) skew of the left and right camera, log aspects, of A (..., 2, 2, 3): all 0 for square pixels."""
+    """(..., 4) skews of left and right camera and logs of their pixel aspects, from A (..., 2, 2, 3); 0 for square pixels."""
     size = np.linalg.norm(A, axis=-1)
     skew = (A[..., 0, :] * A[..., 1, :]).sum(axis=-1) / size.prod(axis=-1)
     return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
 def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[int, float], bool]]:
-    """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
+    """A robot axis of the wrong scale: the jaw lengths in the log then depend on their direction, not only on the opening.
 
-    If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
-    Returns what that shows, and whether it refutes that an axis, 0 to 2, is so many times too long.
+    If n is the component of a jaw's direction along an axis that is s times too long, length^-2 is scaled by
+    1 - (1 - s^-2) n^2.  Returns the hypotheses, and a function (axis 0 to 2, s) that is True if the lengths refute s.
     """
     x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
     jaws = x[:, 1:] - x[:, :1]
@@ -111,29 +111,29 @@ def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[int, float], bool]]:
         return [], lambda axis, scale: False
     opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
     n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
-    # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
-    told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
+    # Eight numbers of each jaw: length^-2, n^2, n, and its position along itself.  Averages over stretches have less noise.
+    of_jaws = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
     each = int(np.clip(len(x) / _STRETCHES, 1, 100))
-    both = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3), told.reshape(len(x), -1)
-    opened, told = (v[: len(x) // each * each].reshape(-1, each, v.shape[1]).mean(axis=1) for v in both)
-    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)  # what the opening leaves
+    both = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3), of_jaws.reshape(len(x), -1)
+    opened, of_jaws = (v[: len(x) // each * each].reshape(-1, each, v.shape[1]).mean(axis=1) for v in both)
+    rest = (of_jaws - opened @ np.linalg.lstsq(opened, of_jaws, rcond=None)[0]).reshape(-1, 8)  # not due to the opening
     length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
     along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
     slopes, squared, enough = common / along, (n**2).mean(axis=(0, 1)), turns.std(axis=0) >= _TURNED
-    sums = [part.sum(axis=0) for part in np.array_split(turns * (length[:, None] - slopes * turns), _PARTS)]  # errors last
+    sums = [part.sum(axis=0) for part in np.array_split(turns * (length[:, None] - slopes * turns), _PARTS)]  # errors persist
     sds = np.hypot(np.linalg.norm(sums, axis=0) / along, _OWN_SD)
 
     def refuted(axis: int, scale: float) -> bool:
-        """Whether the slope that this would make is missing, though the jaws turn enough to show it."""
+        """True if the jaws turn enough to show the slope that this scale would cause, but do not show it."""
         q = 1.0 - scale**-2.0
-        due, slope = -q / (1.0 - q * squared[axis]), slopes[axis]
-        return bool(enough[axis] and abs(slope) < abs(due) / 2 and abs(due - slope) > _SURE_SCALED * sds[axis])
+        expected, slope = -q / (1.0 - q * squared[axis]), slopes[axis]
+        return bool(enough[axis] and abs(slope) < abs(expected) / 2 and abs(expected - slope) > _SURE_SCALED * sds[axis])
 
     k = (common**2 / along).argmax()
     slope, sd, total = slopes[k], float(sds[k]), length @ length
-    # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
+    # A base with an offset from the tips, or tips that lag behind the base, change the lengths in other ways (`others`).
     left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
-    most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
+    most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # 1.1 for three more numbers
     found = []
     if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and enough[k] and left @ left <= most:
         scale = float((1 - slope / (slope * squared[k] - 1)) ** -0.5)
@@ -146,10 +146,10 @@ def _jaws(case: Case) -> tuple[list[Hypothesis], Callable[[int, float], bool]]:
 def _scaled_axis(
     A: np.ndarray, covariance: np.ndarray, refuted: Callable[[int, float], bool] = lambda axis, scale: False
 ) -> Iterator[Hypothesis]:  # fmt: skip
-    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong.
+    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), with `covariance` (12, 12), are skewed or oblong.
 
-    Images that were resized to another shape make them oblong, too, and do no harm: the cameras take that on.  Where it is
-    `refuted` that the axis is to blame, something else is.
+    Images that were resized to another aspect make pixels oblong, which does no harm: the cameras absorb it.  If the axis
+    is `refuted` as the cause, the cause is unknown (`odd_pixels`).
     """
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
@@ -166,23 +166,23 @@ def _scaled_axis(
         resized = min(resized, none - float((free @ information @ stated) ** 2 / (free @ information @ free)))
     for axis, values in enumerate(misfit):
         best = int(values.argmin())
-        if not 0 < best < len(values) - 1:  # no scale mends it
+        if not 0 < best < len(values) - 1:  # no scale explains it
             continue
         before, least, after = values[best - 1 : best + 2]
         if least > resized + _RATHER_RESIZED:
             continue
         bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
         log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
-        scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
+        scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A * s is plausible if positions are s times too large
         name = "xyz"[axis]
         text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
-        # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
+        # Correlated errors make the evidence look too strong, and a wrong axis is less likely than a wrong clock: 5.5 off.
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
         size, denied = (scale, sd * scale, "times"), refuted(axis, scale)
         if resized < least + _RATHER_RESIZED:
             if denied:  # then the images were resized, which does no harm
                 continue
-            text += " They may as well be oblong because the images were resized, which cameras take on."
+            text += " Or the images were resized to another aspect, which does no harm: the cameras absorb it."
             explained = min(explained, _UNDECIDED)
         if denied:
             yield Hypothesis("odd_pixels", _ODD_PIXELS, _STEADY, *size, min(explained, _UNDECIDED), gain)
@@ -191,13 +191,13 @@ def _scaled_axis(
 
 
 def stands_exchanged(fit: Robust) -> bool:
-    """Whether the left camera of a fit stands on the right."""
+    """True if the left camera of a fit stands on the right."""
     A, covariance = _of_axes(fit, 1.0)
     return bool(np.isfinite(covariance).all()) and eyes_exchanged(A.reshape(4, 3), _side(A, covariance)[1])
 
 
 def _side(A: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Where the right camera of A (2, 2, 3), of `covariance` (12, 12), stands along the image rows, rad, and deviation."""
+    """Angle by which the right camera of A (2, 2, 3) stands to the right, rad, and its sd by `covariance` (12, 12)."""
     side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
     J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
     return float(side), float(np.sqrt(J @ covariance @ J))
@@ -206,15 +206,15 @@ def _side(A: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
 def _handedness(
     case: Case, A: np.ndarray, covariance: np.ndarray, nearness: tuple[float, float]
 ) -> Iterator[Hypothesis]:  # fmt: skip
-    """A left camera on the right, or a world that looks mirrored: exchanged eyes, a mirrored axis, or mirrored images.
+    """A left camera on the right, or a mirrored world: exchanged eyes, a mirrored axis, or mirrored images.
 
-    Farther things look smaller (`nearness`), unless the world is mirrored.  Where that does not show, a tool that points at
-    the cameras tells: no microscope looks at one from its tips.
+    Farther things look smaller (positive `nearness`) unless the world is mirrored.  If the data do not determine `nearness`,
+    the tool's direction decides: a microscope sees the tips below the base, so tips nearer to it mean a mirrored world.
     """
     view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
     base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
     tool = tips.mean(axis=1) - base[:, 0]
-    ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # of a tool across the view nearly 0
+    ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # near 0 for a tool across the view
     near, known, (curved, curved_sd) = int((ahead < -_ACROSS).sum()), np.isfinite(ahead).sum(), nearness
     share = (near - int((ahead > _ACROSS).sum())) / max(known, 1)
     apart_s = np.ptp(case.problem.time) if np.isfinite(case.problem.time).all() else np.inf

@@ -1,7 +1,7 @@
-"""Hypotheses about what changes from frame to frame: jaws, clocks, images, zooms and robots that do not keep still.
+"""Hypotheses about what varies from frame to frame: jaws, clocks, image shifts, zooms and robot positions.
 
-Each frame has a number of its own, or a few.  These are normal with one standard deviation, which is estimated; the evidence
-of a hypothesis integrates over them.
+Each frame has one or a few parameters of its own.  They are normally distributed with one standard deviation, which is
+estimated.  The evidence of a hypothesis is integrated over them.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,14 +13,14 @@ import numpy as np
 from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
 
 _FEWEST_FRAMES = 8
-_ROUNDS, _STEPS = 8, 10  # of cameras beside the numbers, and of the numbers' deviation beside given cameras
-_GROWS = 1.02  # numbers that tell nothing yet must move the pixels by so much more than in the round before
-_OF_ZOOM = 0.6  # of the detector's errors, by which a zoom must move landmarks: those that they share look less like one
-_MOST = 0.5  # by so much of its RMS a number must differ from 0 in most frames: gross errors are in a part of them
+_ROUNDS, _STEPS = 8, 10  # of the alternation between cameras and parameters; of the parameters' sd with given cameras
+_GROWS = 1.02  # growth of the pixels' shift in a round, below which the rounds end while it is within the detector's error
+_OF_ZOOM = 0.6  # least shift by a zoom over the detector's error: less than 1, as shared errors hardly look like a zoom
+_MOST = 0.5  # least median size of the parameters over their RMS: gross errors only affect a part of the frames
 
 
 def rigid_tips(case: Case) -> Iterator[Hypothesis]:
-    """The robot reports tips at a fixed distance while the jaws open."""
+    """The robot reports tips at a constant distance while the jaws open."""
     problem, tips = case.problem, case.by_frame(case.problem.x[:, 0])
     width = np.linalg.norm(tips[:, 2] - tips[:, 1], axis=1)
     width = width[np.isfinite(width)]
@@ -29,88 +29,88 @@ def rigid_tips(case: Case) -> Iterator[Hypothesis]:
     half = problem.axes[:, :, 1] * np.array([0.0, -1.0, 1.0])[np.minimum(problem.landmark, 2), None]
     found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None], 0.2)
     size = 2.0 * float(found.theta.std())
-    text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
+    text = f"The robot always reports tips {width.mean():.2f} mm apart; in the images this varies by {size:.2f} mm."
     cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
     yield case.found("rigid_tips", found.fit, 1, (size, 0.0, "mm"), text, cure, raw=found.raw)
 
 
 def is_constant(width_mm: np.ndarray) -> bool:
-    """Whether the robot reports one opening of the jaws, but for its noise."""
+    """True if the robot reports a constant opening of the jaws, apart from its noise."""
     return bool(width_mm.std() <= max(0.02 * width_mm.mean(), 0.03))
 
 
 def unsteady(case: Case) -> Iterator[Hypothesis]:
-    """Robot and images part from frame to frame, all landmarks alike: anyhow, or in time; or an image sways, or zooms."""
+    """All landmarks of a frame deviate together: by the robot's position, by the time, or as an image shifts or zooms."""
     problem = case.problem
-    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0:  # too little to tell such numbers from noise
+    if case.frames < _FEWEST_FRAMES or np.ptp(problem.landmark) == 0:  # too few to distinguish these from noise
         return
     found = _by_frame(case, lambda M: np.broadcast_to(M[:, :, :3], (len(problem), 2, 2, 3)), 0.05)
     size, each = np.sqrt(3.0) * found.sd, [problem.x[problem.landmark == k, 0] for k in np.unique(problem.landmark)]
     moves = max(np.ptp(x, axis=0).max() for x in each) > case.robot_mm
-    if moves and _tells(case, found) and size > case.robot_mm:
-        text = f"From frame to frame images and robot part by {size:.2g} mm (RMS), all landmarks alike."
+    if moves and _is_distinct(case, found) and size > case.robot_mm:
+        text = f"From frame to frame images and robot differ by {size:.2g} mm (RMS), equally for all landmarks."
         cure = "Fix the microscope and the robot's base; check times, units and columns of kinematics.csv."
         yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
     if moves and case.paths:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
-        if _tells(case, found):
-            text = f"The times of the frames err by {1e3 * found.sd:.2g} ms (RMS), each by itself, or those of the log do."
-            cure = "Write down when the camera exposed each frame, and the robot measured each position; do not round."
+        if _is_distinct(case, found):
+            text = f"The time stamps of frames or log have independent errors of {1e3 * found.sd:.2g} ms (RMS)."
+            cure = "Record when the camera exposed each frame and when the robot measured each position; do not round."
             yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
     shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
     zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
-    sways = shift, 3.0, 1.0, "px", "image_sways", "sways", "Fix that camera, and turn off stabilisation of the image."
+    sways = shift, 3.0, 1.0, "px", "image_sways", "shifts", "Fix that camera, and turn off image stabilisation."
     zooms = zoom, 1.0, _OF_ZOOM, "%", "zoom_varies", "zooms in and out", "Record without autofocus, at one zoom."
     for views, (columns, sd, share, unit, name, does, cure) in (
         ((0,), sways), ((1,), sways), ((0, 1), zooms), ((0,), zooms), ((1,), zooms)
     ):  # fmt: skip
         moved = np.concatenate([columns * (np.arange(2) == view)[:, None, None] for view in views], axis=3)
         found = _by_frame(case, lambda M, moved=moved: moved, sd)
-        if _tells(case, found, share):
+        if _is_distinct(case, found, share):
             who = "Each image" if len(views) == 2 else f"The {SIDES[views[0]]} image alone"
             size = found.sd * np.sqrt(columns.shape[3])
             text = f"{who} {does} from frame to frame, by {size:.2g} {unit} (RMS)."
             yield case.found(name, found.fit, 1, (size, 0.0, unit), text, cure, raw=found.raw, images=views)
 
 
-class _Numbers(NamedTuple):
-    """The frames' numbers theta (frames, k), normal with deviation sd, the fit beside them, and how far they move pixels."""
+class _PerFrame(NamedTuple):
+    """Parameters of the frames, and the fit with them."""
 
     fit: Robust
-    theta: np.ndarray
-    sd: float
-    moved_px: float  # RMS
-    raw: float  # gain in log likelihood, theta integrated out
+    theta: np.ndarray  # (frames, k)
+    sd: float  # of theta, which is normally distributed
+    moved_px: float  # RMS shift of the pixels by theta
+    raw: float  # gain in log likelihood, integrated over theta
 
 
-def _tells(case: Case, found: _Numbers, share: float = 1.0) -> bool:
-    """Whether most frames have such a number, and these move pixels by more than a share of what the detector may err by.
+def _is_distinct(case: Case, found: _PerFrame, share: float = 1.0) -> bool:
+    """True if most frames have large parameters, and these shift pixels by more than `share` times the detector's error.
 
-    Errors that the landmarks of a frame share look like these causes.
+    Detection errors that the landmarks of a frame share look like these causes.
     """
     size2 = (found.theta**2).sum(axis=1)
     return bool(np.median(size2) > _MOST**2 * size2.mean() and found.moved_px > share * _claimed_px(case))
 
 
 def _claimed_px(case: Case) -> float:
-    """By how much the detector may err: as it says, else by the residuals."""
+    """The detector's error, px: as it states, else from the residuals."""
     return case.problem.claimed_px() or np.sqrt(2.0) * case.null.shapes[0].scale
 
 
-def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float) -> _Numbers:
-    """The numbers of the frames of which each moves pixels by a column of columns(M) (n, 2, 2, k); `sd` is a first guess."""
+def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float) -> _PerFrame:
+    """Fit parameters of each frame; columns(M) (n, 2, 2, k) are derivatives of the pixels by them, `sd` is a first guess."""
     problem = moved = case.problem
     fit, moved_px = case.null, 0.0
     for _ in range(_ROUNDS):
         D, shape = columns(fit.M), fit.shapes[0]
         k, r2 = D.shape[3], (fit.residuals**2).sum(axis=2) / problem.noise**2
         weight = np.where(problem.used, (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2) / problem.noise**2, 0.0)
-        left = np.nan_to_num(problem.y - moved.y + fit.residuals)  # by cameras without these numbers
+        r = np.nan_to_num(problem.y - moved.y + fit.residuals)  # residuals without these parameters
         H, b = np.zeros((case.frames, k, k)), np.zeros((case.frames, k))
         np.add.at(H, problem.frame, np.einsum("nc,ncia,ncib->nab", weight, D, D))
-        np.add.at(b, problem.frame, np.einsum("nc,ncia,nci->na", weight, D, left))
-        H, axes = np.linalg.eigh(H)  # (frames, k), and the axes along which the numbers of a frame are independent
+        np.add.at(b, problem.frame, np.einsum("nc,ncia,nci->na", weight, D, r))
+        H, axes = np.linalg.eigh(H)  # (frames, k), and the axes along which the parameters of a frame are independent
         b = (b[:, None] @ axes)[:, 0]
         for _ in range(_STEPS):
             variance = 1.0 / (H + sd**-2)
@@ -124,11 +124,11 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
         moved_px = float(np.sqrt((shift**2).sum(axis=2)[own].mean())) if own.any() else 0.0
         if moved_px < min(_GROWS * before_px, _claimed_px(case)):
             break
-    chosen = 0.5 * float(np.log1p(sd**2 * H).sum() + ((theta / sd) ** 2).sum())
-    return _Numbers(fit, theta, sd, moved_px, fit.total - case.null.total - chosen)
+    penalty = 0.5 * float(np.log1p(sd**2 * H).sum() + ((theta / sd) ** 2).sum())  # Laplace's approximation of the integral
+    return _PerFrame(fit, theta, sd, moved_px, fit.total - case.null.total - penalty)
 
 
-#: Causes that have so many numbers that they leave white residuals, whatever is wrong.
+#: Causes with parameters for each frame, so many that they leave white residuals, whatever is wrong.
 OF_FRAMES = ("robot_noise", "time_stamps", "image_sways", "zoom_varies")
-#: They need nothing but the rows, and the tool's path in time where there is one.
+#: Tests that only need the rows; some also use the tool's path over time if there is one.
 FRAME_TESTS = (rigid_tips, unsteady)

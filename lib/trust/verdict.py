@@ -1,4 +1,4 @@
-"""Verdicts: may a number of this recording be believed, why not, and what to do (all thresholds stand here)."""
+"""Verdicts: whether the numbers of a recording can be trusted, why not, and what to do.  All thresholds are defined here."""
 
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,58 +23,58 @@ from lib.trust.optics import SURE_CURVED
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
 #: Check -> values at which a verdict becomes doubtful, and not trustworthy.
 LIMITS: dict[str, tuple[float, float]] = {
-    # RMS of the residuals, each over its claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
+    # RMS of residuals over their claimed sd.  Heavy tails (Student t, 4 degrees of freedom) reach 1.5; a clock 5 ms off 2.
     "residuals": (1.7, 2.6),
-    # Cross-validated over fitted RMS, beyond what the leverages let expect.  Clean data of 6 rows reach 1.6.
+    # Cross-validated over fitted RMS, relative to the ratio that the leverages predict.  Clean data of 6 rows reach 1.6.
     "cross_validation": (2.0, 4.0),
-    # Share of the usable rows that agree on the cameras: a bare majority may be the wrong one.
+    # Share of the usable detections that agree on the cameras: a bare majority may be the wrong one.
     "consensus": (0.75, 0.5),
-    # Frames with rows that agree.  Of 6 clean frames on the covariances are right; of 3 nothing checks anything.
+    # Frames with inliers.  From 6 clean frames on the covariances are right; 3 frames leave nothing to check against.
     "frames": (6, 4),
-    # Rows of independent errors: a pair has 14 parameters, four numbers a row.  Their estimate is too low where rows are few.
+    # Effective number of independent rows: a pair has 14 parameters, a row four numbers.  The estimate is low for few rows.
     "rows": (6, 0),
-    # Degrees between the viewing directions: a microscope's are 2 to 20 apart; beyond 45 no two of its eyes see one scene.
+    # Degrees between the viewing directions: 2 to 20 in a microscope; beyond 45 both cameras cannot see the same scene.
     "convergence_low": (1.0, 0.3),
     "convergence_high": (25.0, 45.0),
-    # Zoom of one camera over the other's, and along x over along y: optics of one microscope differ by some per cent.
+    # Ratio of the two cameras' zooms, and of a camera's zooms along x and y: within one microscope a few per cent from 1.
     "zoom_ratio": (1.3, 2.0),
     "aspect": (1.08, 1.25),
-    # Degrees by which one image is turned against the other.
+    # Rotation of one image against the other, degrees.
     "roll": (30.0, 90.0),
     # One image is a mirror image (1) or not (0).
     "mirrored": (0.5, np.inf),
-    # Standard deviations of 1/distance below 0, as which farther things look larger.
+    # Standard deviations by which 1/distance is below 0, so that farther things look larger.
     "hollow": (SURE_CURVED, SURE_CURVED + 2.0),
-    # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
+    # Depth error of a landmark by the calibration over that by the detector, at the edge of the tool's volume.
     "coverage": (1.5, np.inf),
-    # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
+    # RMS thickness of the volume of positions over the robot's standard deviation: a thinner one may be noise.
     "thin": (4.0, 2.0),
-    # The same of each landmark's own positions, across the line or out of the plane that they lie nearest to.
+    # The same for each landmark's own positions: RMS distance from their best line, and from their best plane.
     "one_line": (4.0, 4.0),
     "one_plane": (4.0, 0.0),
-    # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
+    # Median epipolar distance of free matches, px, minus three of its standard deviations: band matching fails from 6 px.
     "epipolar": (1.5, 4.0),
-    # Share of the landmarks that contradict themselves, the other image or the robot.  10 % gross errors a view reach 0.2.
+    # Share of bad landmarks (`Health.unhealthy`).  10 % of gross errors in each image give 0.2.
     "health": (0.25, 0.5),
     # Share of the residuals' variance that a named fault explains.
     "diagnosis": (0.0, 0.5),
 }  # fmt: skip
-#: Pixel noise assumed where the detections claim none: that of labels set by hand.
+#: Pixel noise that is assumed if the detections state none: that of labels set by hand.
 _LABEL_PX = 3.0
-#: A scene contradicts cameras by which landmarks move more than this, px, and so many times as far as the scene: the tool is
-#: nearer, but not by that much.  A scene that moved farther than the third contradicts a tool that slipped.
+#: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
+#: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
-#: The texts and the page of this folder, compiled once.
+#: The templates of this folder, compiled once.
 TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape(), trim_blocks=True)
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One finding against a calibration: what it makes of the verdict, the number and its limit, and what to do."""
+    """One reason for doubt about a calibration: the level it leads to, the number and its limit, and what to do."""
 
     name: str
     level: str
@@ -88,7 +88,7 @@ class Reason:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The worst of its reasons; trustworthy without any.
+    """A verdict and its reasons: the level is that of the worst reason, and trustworthy without any.
 
     >>> verdict = Verdict((Reason("few_frames", "doubtful", "5 frames; 6 or more are needed.", "Record more."),))
     >>> verdict.level, Verdict.join([verdict, Verdict()]).level, Verdict().level
@@ -104,17 +104,17 @@ class Verdict:
 
     @property
     def is_red(self) -> bool:
-        """True where no number that follows from the calibration should be stated."""
+        """True if no number that follows from the calibration should be stated."""
         return self.level == LEVELS[2]
 
     @classmethod
     def join(cls, parts: Iterable[Self]) -> Self:
-        """The reasons of several verdicts, the worst first; of two with one name and level, the first."""
+        """The reasons of several verdicts, the worst first; of those with equal name and level only the first is kept."""
         found = {(reason.name, reason.level): reason for part in reversed(list(parts)) for reason in reversed(part.reasons)}
         return cls(tuple(sorted(reversed(found.values()), key=lambda reason: -LEVELS.index(reason.level))))
 
     def to_json(self) -> dict:
-        """As it stands in check.json and metrics.json."""
+        """The verdict as in check.json and metrics.json."""
         return {"verdict": self.level, "reasons": [vars(reason).copy() for reason in self.reasons]}
 
     def __str__(self) -> str:
@@ -126,15 +126,15 @@ def judge(
     health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float = 0.010,
     error: Exception | None = None, doubts: Sequence[Doubt] = (), epipolar_at_mm: np.ndarray | None = None,
 ) -> Verdict:  # fmt: skip
-    """The verdict on a calibration from its own numbers and from witnesses; what is None is left out.
+    """The verdict on a calibration, from its own numbers and from independent evidence; arguments that are None are skipped.
 
     Args:
-        data: What was calibrated with; only its frames tell whether they are enough.
-        calibration: None where it was refused; then `error` is the exception.
-        epipolar_px: Median epipolar distance of matches between the two images, which know nothing of the tool.
-        epipolar_at_mm: (k, 3) where these matches are, by the calibration; None takes them for near the tool.
-        robot_accuracy_mm: As its maker states it.
-        doubts: Of the recording (`lib.recordings.Recording.doubts`).
+        data: The calibrated rows; needed for the checks of frames, and of each landmark's motion.
+        calibration: None if it was refused; then `error` is the exception.
+        epipolar_px: Median epipolar distance of features matched between the two images, independent of the tool.
+        epipolar_at_mm: (k, 3) positions of these features by the calibration; None assumes that they are near the tool.
+        robot_accuracy_mm: Standard deviation of the robot's position per coordinate, as the manufacturer states it.
+        doubts: The doubts of the recording (`lib.recordings.Recording.doubts`).
     """
     found: list[Reason] = []
     best = None if diagnosis is None else diagnosis.best
@@ -149,7 +149,7 @@ def judge(
         cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         if name == "refused":  # the error names its cure
             few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
-            cure = _MORE_FRAMES if few else "Mend that, then check again."
+            cure = _MORE_FRAMES if few else "Correct that, then check again."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
         what = data, calibration, robot_accuracy_mm
@@ -161,10 +161,10 @@ def judge(
             sd = np.sqrt(np.median(n @ calibration.projection_covariance(at_mm) @ n))
             text = f"Features of both images lie {epipolar_px:.1f} px (median) off the epipolar lines; "
             text += f"{LIMITS['epipolar'][0]:g} are allowed."
-            cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
+            cure = "Did a camera move, or were left and right not taken at the same instant? Calibrate again."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        if best is not None and best.name not in OF_DETECTOR:  # what contradicts the robot is no detector's fault
+        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for robot errors
             health = health.without_robot
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
@@ -174,7 +174,7 @@ def judge(
 
 
 def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> list[Reason]:
-    """A reason where the value is beyond a limit of the check, on the side on which the second limit lies."""
+    """One reason if the value is beyond a limit, else none; low values are bad if the red limit is not higher."""
     doubtful, red = LIMITS[check]
     sign = 1.0 if red > doubtful else -1.0
     if not sign * value > sign * doubtful:
@@ -183,7 +183,7 @@ def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> l
 
 
 def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
-    """What `_reason` takes: how large the residuals are, and how many rows they are of."""
+    """Arguments of `_reason`: the size of the residuals, and the number of rows and frames that agree."""
     used, views = c.inliers, c.view_inliers[c.inliers]
     variance = np.full((1, 2 * views.shape[1]), _LABEL_PX**2)
     if c.covariance_px2 is not None:
@@ -192,23 +192,23 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     gain = [(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras]
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
-    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
-    more = " Constant offsets of the landmarks need four frames and more, half of all, with open jaws." * (c.offsets is None)
+    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times as large as detector and robot claim."
+    more = " Landmark offsets were not fitted: this needs open jaws in four frames, and in half of all." * (c.offsets is None)
     yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector.{more}"
 
-    # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
+    # With clean data, the residual of a row that is left out grows by the factor (1 - leverage)^-1/2.
     m = c.leverage.shape[1]
     expected = np.sqrt(np.mean(np.trace(np.linalg.inv(np.eye(m) - c.leverage), axis1=1, axis2=2) / m))
     ratio = c.press_rms_px / max(c.reprojection_rms_px * expected**2, 1e-9)
-    text = f"Rows left out are predicted with {c.press_rms_px:.3g} px, rows fitted with {c.reprojection_rms_px:.3g} px RMS."
+    text = f"RMS errors: {c.press_rms_px:.3g} px of rows left out of the fit, {c.reprojection_rms_px:.3g} px of fitted ones."
     yield "cross_validation", ratio, text, "A few rows decide everything: move the tool through the whole volume."
 
     usable = int(np.isfinite(c.residuals_px).sum()) // 2
     share = float(c.view_inliers.sum() / usable)
     text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
-    yield "consensus", share, text, f"{_OVERLAYS}: the other detections are wrong, or these are.", "minority"
+    yield "consensus", share, text, f"{_OVERLAYS}: either the other detections are wrong, or these are.", "minority"
 
-    text = f"The rows that agree count as {c.effective_rows:.1f} of independent errors; {LIMITS['rows'][0]:g} are needed."
+    text = f"The rows that agree are worth {c.effective_rows:.1f} with independent errors; {LIMITS['rows'][0]:g} are needed."
     yield "rows", c.effective_rows + 1e-9, text, _MORE_FRAMES, "few_rows"
     if data is not None:
         frames = len(np.unique(data.frame[used]))
@@ -217,20 +217,20 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
 
 
 def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
-    """What `_reason` takes: how the tool moved, the optics that follow from the cameras, and the volume that it covered."""
+    """Arguments of `_reason`: how the tool moved, the optics that the cameras imply, and the volume that the tool covered."""
     x = c.x_mm[c.inliers]
     if data is not None and np.ptp(landmark := data.landmark[c.inliers]):
         own = extents(np.concatenate([x[landmark == k] - x[landmark == k].mean(axis=0) for k in np.unique(landmark)]))
         shape, size_mm = ("line", own[1]) if own[1] < LIMITS["one_line"][0] * robot_mm else ("plane", own[2])
-        text = f"Each landmark stays within {size_mm:.3f} mm (RMS) of one {shape}. Across it the cameras rest on the tool's "
-        text += "shape as the robot reports it, which may be off."
+        text = f"Each landmark stays within {size_mm:.3f} mm (RMS) of one {shape}. Across it the calibration relies on the "
+        text += "tool's shape as the robot reports it, which may be wrong."
         yield f"one_{shape}", size_mm / robot_mm, text, "Move the tool in all three directions, and turn it."
-        if shape == "line":  # the optics would rest on that shape, too
+        if shape == "line":  # the optics would rely on the tool's shape, too
             return
     zooms, name = np.array([np.diag(camera.resect().K) for camera in c.cameras]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
-    text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within some per cent."
+    text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within a few per cent."
     yield "aspect", aspect, text, f"If the images were resized to another shape, undo that. Otherwise: {cure}", name
     if c.rig is None:
         return
@@ -242,34 +242,34 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
     mirrored, roll = optics(c).mirrored, abs(np.rad2deg(optics(c).roll_rad))
-    text = f"The images are turned by {roll:.0f} degrees against each other."
-    if mirrored not in ("left", "right", "left or right"):  # a mirror image looks turned, too
-        yield "roll", roll, text, "Turn one of them back: surfaces cannot be matched otherwise.", "turned_image"
+    text = f"The images are rotated by {roll:.0f} degrees against each other."
+    if mirrored not in ("left", "right", "left or right"):  # a mirror image looks rotated, too
+        yield "roll", roll, text, "Rotate one of them back: surfaces cannot be matched otherwise.", "turned_image"
     text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
-    cure = "Flip that image when recording, or exchange the sign of the axis."
+    cure = "Flip that image when recording, or change the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
     nearness, sd = c.inverse_distance_per_mm
     text = "Farther things look larger: both images are mirrored, or a left-handed robot frame goes with exchanged eyes."
     cure = "Flip both images, or use a right-handed robot frame and exchange left and right."
     yield "hollow", -nearness / sd if sd > 0 else 0.0, text, cure, "mirrored_images"
 
-    text = f"The tool's positions lie {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
+    text = f"The positions lie only {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
     yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
     alone, both = (c.depth_sd_mm(corners, detection=detection).max() for detection in (False, True))
     sizes = " x ".join(f"{value:.1f}" for value in high - low)
-    text = f"The tool covers {sizes} mm: the calibration itself leaves {1e3 * alone:.0f} um of depth open at its corners."
-    cure = "Move the tool through more depths and corners; notebook 03 finds the positions that tell most."
+    text = f"The tool covers {sizes} mm: at its corners the calibration alone has a depth error of {1e3 * alone:.0f} um (sd)."
+    cure = "Move the tool through more depths and corners; notebook 03 finds the most informative positions."
     yield "coverage", float(alone / np.sqrt(max(both**2 - alone**2, 1e-12))), text, cure
 
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """What `assess` found: no calibration where it was refused; the verdict says why.
+    """The result of `assess`; `calibration` is None if it was refused, and the verdict says why.
 
-    `epipolar_px` is the median epipolar distance of features that both images share; NaN where too few are.
+    `epipolar_px` is the median epipolar distance of features that both images show; NaN if there are too few.
     """
 
     data: Correspondences
@@ -283,26 +283,26 @@ class Assessment:
 def assess(
     recording: Recording, data: Correspondences | None = None, *, detector: Callable | None = None, **options: object
 ) -> Assessment:  # fmt: skip
-    """Calibrate, diagnose, look at the detector's health and at a witness, and judge; what is refused is a reason.
+    """Calibrate, diagnose, test the detector's health and the epipolar lines, and judge; a refused calibration is a reason.
 
     Args:
-        data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
-        detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows.
+        data: Correspondences of the recording, detected or labelled; None runs the detector (by default that which ships).
+        detector: The one that made `data`.  It is run again on some frames, mirrored and shifted.
+        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or near-affine if a distance shows.
 
-    A ValueError for data of frames that the recording lacks.
+    Raises ValueError if `data` has frames that the recording lacks.
     """
     if data is None:
         detector = detector or Detector.load()
         data = detect(recording, detector)
     if (last := data.frame.max(initial=0)) >= len(recording):
-        raise ValueError(f"data: frame {last} is none of the {len(recording)} of {recording.folder}; give its own.")
+        raise ValueError(f"data: frame {last} is not among the {len(recording)} of {recording.folder}; give data of these.")
     calibration, error, epipolar_px, at_mm = None, None, np.nan, None
     try:
         fit = calibrate if "model" in options else calibrate_as_shown
         calibration = fit(data, image_size_px=recording.image_size_px, **options)
     except np.linalg.LinAlgError:
-        error = DataError("the fit runs away; no cameras see these rows so. Check times, axes and units of kinematics.csv.")
+        error = DataError("the fit diverges; no cameras explain these rows. Check times, axes and units of kinematics.csv.")
     except ValueError as refused:
         error = refused
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
@@ -310,22 +310,22 @@ def assess(
         known = np.isfinite(features.x_mm).all(axis=1)
         epipolar_px, at_mm = float(np.median(np.abs(features.epipolar_px))), features.x_mm[known] if known.any() else None
     straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
-    if near:  # a lens that distorts is no fault either, and what the robot parks behind a camera is seen nowhere
+    if near:  # then lens distortion is no fault either, and positions behind a camera are not visible
         left, right = calibration.cameras
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
-    near |= calibration is None and fit is calibrate_as_shown  # which finds a distance itself
+    near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
     if (best := diagnosis.best) is not None and best.name in ("camera_moved", "tool_slipped") and len(best.images) == 2:
         pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
         first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-        moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h is not best]  # NaN tells nothing
+        moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h is not best]  # NaN decides nothing
         if best.name == "tool_slipped" and (moved_px > _MOVED_PX).all():
             diagnosis = Diagnosis(tuple(others))
         elif best.name == "camera_moved" and (best.value > _NEARER_PX + _TIMES * moved_px).all():
-            text = "Images and robot part" + best.text[best.text.index(" at about frame") :]
-            text += " What lies behind the tool stands still: the robot's report jumped."
+            text = "Images and robot disagree" + best.text[best.text.index(" at about frame") :]
+            text += " The scene behind the tool stands still, so the robot's report jumped."
             jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
             diagnosis = Diagnosis((jumped, *others))
     found = health(recording, data, calibration, detector=detector)
@@ -337,26 +337,26 @@ def assess(
     if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        theirs = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
-        reasons = [replace(r, cure=cure) if r.name in theirs else r for r in reasons]
-    told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
-    return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)
+        by_labels = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
+        reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
+    reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
+    return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px)
 
 
 def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:
-    """A calibration in several lines of text, with at most ten outliers, largest residual first.
+    """A calibration as several lines of text, with at most ten outliers, largest residual first.
 
-    Without the verdict of `lib.trust.assess`, the calibration's own numbers are judged alone.
+    Without the verdict of `lib.trust.assess`, only the calibration's own numbers are judged.
     """
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
-    c, told = calibration, {}
+    c, stereo = calibration, {}
     seen = np.isfinite(c.residuals_px[:, ::2])
     outliers = np.argwhere(seen & ~c.view_inliers)
     size_px = np.linalg.norm(c.residuals_px.reshape(*seen.shape, 2)[tuple(outliers.T)], axis=1)
     if c.rig is not None:
         depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, True))
-        told = {"optics": optics(c), "depth_um": [1e3 * np.median(depth) for depth in depths], "degrees": np.rad2deg}
+        stereo = {"optics": optics(c), "depth_um": [1e3 * np.median(depth) for depth in depths], "degrees": np.rad2deg}
     return TEMPLATES.get_template("report.txt").render(
-        told, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
+        stereo, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
         worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]],
     ).rstrip()  # fmt: skip

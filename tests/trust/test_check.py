@@ -140,5 +140,5 @@ def test_a_folder_that_is_no_recording(tmp_path):
 def test_a_detector_that_cannot_act_is_refused(folder):
     """Of other landmarks than its own only labels tell."""
     other = replace(Recording.open(folder, truth=False), skeleton=("hinge", "left", "right"))
-    with pytest.raises(ValueError, match=r"detector \(--weights\): none knows hinge, left, right; leave it out"):
+    with pytest.raises(ValueError, match=r"detector \(--weights\): no detector knows hinge, left, right; leave it out"):
         check(other, detector=lambda images: None)

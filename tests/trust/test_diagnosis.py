@@ -390,7 +390,7 @@ def test_pixels_that_no_axis_explains_accuse_none():
 
 def test_a_log_of_another_time_accuses_the_clock_and_no_detector():
     best = found(take(offset_s=100.0)).best
-    assert best.name == "clock" and "100 % of the frames, which are of 100.0 to 102.6 s" in best.text
+    assert best.name == "clock" and "100 % of the frames (100.0 to 102.6 s" in best.text
 
 
 def test_too_little_to_say_anything():

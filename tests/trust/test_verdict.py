@@ -133,7 +133,7 @@ def test_a_refusal_names_its_own_cure():
     with pytest.raises(DataError, match="coplanar") as error:
         calibrate(flat)
     (reason,) = judge(flat, None, error=error.value).reasons
-    assert reason.name == "refused" and reason.cure == "Mend that, then check again."
+    assert reason.name == "refused" and reason.cure == "Correct that, then check again."
     assert "cover a few depths as well" in reason.text
 
 
@@ -193,7 +193,7 @@ def test_no_detection_is_one_message():
 
 def test_data_of_frames_that_the_recording_lacks_are_refused():
     recording = Recording.open(paths.SHIPPED_RECORDING)
-    with pytest.raises(ValueError, match=r"data: frame 59 is none of the 34 of .*open_sky_eye"):
+    with pytest.raises(ValueError, match=r"data: frame 59 is not among the 34 of .*open_sky_eye"):
         assess(recording, made(60))
 
 
@@ -203,7 +203,7 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     late = data.frame >= len(recording) // 2
     x_mm = data.x_mm + late[:, None] * np.array([0.5, 0.3, 0.2])
     (reason,) = (r for r in assess(recording, replace(data, x_mm=x_mm)).verdict.reasons if r.name == "robot_jumped")
-    assert "Images and robot part at about frame 17" in reason.text and "moved" not in reason.text
+    assert "Images and robot disagree at about frame 17" in reason.text and "moved" not in reason.text
     monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
     names = [r.name for r in assess(recording, replace(data, x_mm=x_mm)).verdict.reasons]
     assert "camera_moved" in names and "robot_jumped" not in names
