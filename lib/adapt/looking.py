@@ -1,4 +1,4 @@
-"""What a detector sees in some frames: anywhere, near where the robot says, or apart from what stands still."""
+"""Detections in some frames: anywhere, near the robot's report, or only where the image differs from the ground."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Self
@@ -12,12 +12,12 @@ from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
-#: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
+#: A detected tool stands still if it is within this share of its length of the same place in at least so many frames.
 _STILL, _STILL_FRAMES = 0.15, 4
 
 
 class Seen(NamedTuple):
-    """Landmarks of m stereo frames: u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2), confidence (m, 2, 3)."""
+    """Detections in m stereo frames: frame (m,), u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2) px^2, confidence (m, 2, 3)."""
 
     frame: np.ndarray
     u: np.ndarray
@@ -26,28 +26,28 @@ class Seen(NamedTuple):
 
     @classmethod
     def by_hand(cls, u: np.ndarray) -> Self:
-        """Labels set by hand: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        """Labels set by hand as detections: u (all frames, 2, 3, 2) px, NaN where there is none."""
         frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
         nothing = np.full((len(frames), 2, 3, 2), np.nan)
         return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
 
     @property
     def stacked_px(self) -> np.ndarray:
-        """(m, 3, 4) px of left and right."""
+        """(m, 3, 4) px: left x, y, right x, y."""
         return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
 
     def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
-        """With the robot's positions; of a confidence below `least` nothing counts."""
+        """The detections paired with the robot's positions; those with a confidence below `least` do not count."""
         known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
         known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
         return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
 
     def of(self, frames: np.ndarray) -> Self:
-        """Those of some frames."""
+        """The detections of the given frames."""
         return Seen(*(part[np.isin(self.frame, frames)] for part in self))
 
     def labelled(self, u: np.ndarray) -> Self:
-        """With labels set by hand in place of what was found there: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        """A copy in which labels set by hand, u (all frames, 2, 3, 2) px or NaN, replace detections of their landmarks."""
         u = u[self.frame]
         known = np.isfinite(u).all(axis=-1)
         covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
@@ -58,7 +58,7 @@ def look(
     recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
-    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
+    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search there."""
     found, known = [], with_ground(detector, recording)
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
@@ -69,9 +69,9 @@ def look(
 
 
 def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
-    """(m, 2) which tools stand in their image where those of other frames do, while the robot's x_mm (m, 3, 3) moves.
+    """(m, 2) bool: the detected tool stands where it stands in other frames, although the robot's x_mm (m, 3, 3) moves.
 
-    The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
+    The robot must move in more than one direction, since a tool that moves along the view stands still in the image.
     """
     centre, length_mm = x_mm.mean(axis=1), np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1)
     known, found = np.isfinite(centre).all(axis=1), np.zeros((len(x_mm), 2), bool)
@@ -90,7 +90,7 @@ def look_elsewhere(
     recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
-    """`seen`; where its tools are `still` (m, 2), what the detector finds in what differs from the ground instead."""
+    """A copy of `seen`; tools that are `still` (m, 2) are detected again, only where images differ from the ground."""
     found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
     for k, (i, side) in enumerate(images):
         frame = recording.frames[int(seen.frame[i])]

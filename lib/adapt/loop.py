@@ -1,4 +1,4 @@
-"""Detect, calibrate, project, train further, detect again: until frames that took no part agree no better."""
+"""Detect, calibrate, project the robot's landmarks, train, and again, until the frames for stopping agree no better."""
 
 import json
 import sys
@@ -28,27 +28,27 @@ from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 from lib.trust.health import spread
 
-#: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
+#: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 22  # raised where teaching or training changes: what an older one kept is not gone on with
-#: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
+RECIPE = 22  # version of teaching and training; intermediate results of other versions are not used
+#: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
-#: Said of a log of which more than half stays as it is.
+#: Note if more than half of the log was not smoothed.
 _UNSMOOTHED = (
     "The robot's log was not smoothed: it is short, repeats samples, is too slow for the motion, or is noisier than the "
     "{:.2g} um of robot_accuracy_mm in recording.toml. Log faster, or correct that number."
 )
-#: Most stereo frames that are looked at, spread over the recording.
+#: Most stereo frames that are used, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
-#: A round that brings the frames for stopping nearer to the robot by less than this share is the last; one that takes them
-#: farther away by more is not kept.  They are few, so the frames for judging decide.
+#: Relative change of the mean distance from the robot in the frames for stopping.  A round that gains less than this is the
+#: last, and one that loses more is not kept.  Those frames are few, so the frames for judging decide.
 _LEAST_GAIN = 0.03
-#: Gain on the frames for judging, in its standard deviations, from which the new weights are kept.  The epipolar lines, in
-#: which the robot has no part, must agree.
+#: Least gain on the frames for judging, in its standard deviations, if new weights are kept.  The epipolar distance, which
+#: does not depend on the robot, must improve as well.
 _SURE_GAIN = 1.0
-#: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
-#: landmark's move ends them.
+#: Most rounds of detection near the robot's landmarks before any training, and the share of the tool's length by which the
+#: robot's landmarks must move for another such round.
 _GUIDED, _SETTLED = 3, 0.01
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
@@ -57,16 +57,16 @@ _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """What `adapt` ended with.
+    """The result of `adapt`.
 
     Attributes:
         detector: The adapted one if `improved`, else the one that was given.
-        calibration: From detections in the frames for learning; None where the recording could not teach.
-        report: What report.json holds.
-        improved: Whether the frames for judging agree better, with the robot and between the two images.
+        calibration: From detections in the frames for learning; None if the recording could not teach.
+        report: The content of report.json.
+        improved: True if the frames for judging agree better, both with the robot and between the two images.
         frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
-        after, seen, told: In the frames for judging: agreement with the robot after, what the two detectors find, and the
-            robot's landmarks (m, 2, 3, 2) px.
+        after, seen, told: In the frames for judging: the agreement of the adapted detector with the robot, the detections
+            before and after, and the robot's landmarks (m, 2, 3, 2) px.
     """
 
     detector: Callable
@@ -84,18 +84,18 @@ def adapt(
     minutes: float = 20.0, seed: int = 0, folder: str | Path | None = None, progress: bool = True,
     tune: Callable[..., Detector] = finetune,
 ) -> Adaptation:  # fmt: skip
-    """Let the robot of a recording teach the detector its landmarks; the truth of a simulated recording is never opened.
+    """Train the detector on landmarks that the robot labels; the ground truth of a simulated recording is never opened.
 
-    The frames are split into three stretches of time.  The first teaches, the second says when to stop, the third judges.
+    The frames are split into three stretches of time: for learning (training), stopping (validation) and judging (test).
 
     Args:
-        recording: With kinematics; the landmarks of a forceps.
-        detector: Where the training starts; None is the one that ships.
-        labels: COCO keypoints like annotations.json; ten labelled pairs are a start where the detector finds too little.
-        minutes: The training ends after so many; detection and judging add a little.
-        seed: Of everything that is drawn.
-        folder: Keeps what is done, from which the same call continues after a kill; None is runs/adapt-NAME.
-        progress: Whether to say on the error stream what is going on and how many minutes are left.
+        recording: A recording of a forceps, with kinematics.
+        detector: The detector to start from; None is the one that ships.
+        labels: COCO keypoints like annotations.json; ten labelled pairs are a start if the detector finds too little.
+        minutes: Duration of the training; detection and judging add a little.
+        seed: Of all random choices.
+        folder: Keeps intermediate results, from which the same call continues after a kill; None is runs/adapt-NAME.
+        progress: Whether to print progress and the remaining minutes to the error stream.
         tune: Trains a detector further on labelled images, with the arguments of `lib.training.stages.finetune`.
 
     Raises:
@@ -113,8 +113,8 @@ def adapt(
         return work.adapted()
     except RefusalError as refused:
         work.report |= {"improved": False, "reason": str(refused)}
-        if said := recording.mistimed:  # so what else was noticed may be no fact
-            work.report |= {"reason": f"{said} If that is meant: {refused}", "notes": []}
+        if mistimed := recording.mistimed:  # then the other findings may be wrong
+            work.report |= {"reason": f"{mistimed} If that is meant: {refused}", "notes": []}
         return Adaptation(work.detector, None, work.finished(), False, {})
 
 
@@ -122,9 +122,9 @@ def adapt_images(
     images: str | Path, labels: str | Path, detector: Detector, *, minutes: float = 20.0, seed: int = 0,
     folder: str | Path | None = None, progress: bool = True, tune: Callable[..., Detector] = finetune,
 ) -> Adaptation:  # fmt: skip
-    """`adapt` where there is no robot: the images of one camera in a folder that `labels` (COCO keypoints) name, at least 10.
+    """`adapt` without a robot: at least 10 images of one camera in the folder `images`, with `labels` (COCO keypoints).
 
-    The first 65 % of them in the order of their names teach, the next fit the doubt, the last fifth judge.
+    In the order of their names, the first 65 % train, the next 15 % fit the error models, and the last 20 % judge.
     """
     images, marked = Path(images), []
     for name, names, values in sorted(coco_keypoints(Path(labels)), key=lambda entry: entry[0]):
@@ -159,13 +159,13 @@ def adapt_images(
     report |= {
         "gain": {"labels": [gain, sd]}, "improved": improved,
         "reason": "the images for judging agree better with their labels" if improved else
-        "on the images for judging the gain is no larger than chance allows",
+        "on the images for judging the gain may be due to chance",
     }  # fmt: skip
     return Adaptation(tuned if improved else detector, None, plain(provenance.so_far() | report), improved, {})
 
 
 class _Work:
-    """The recording, the files that keep what is done, the time left, and the report as it grows."""
+    """An adaptation in progress: the recording, the files with intermediate results, the time left, the report so far."""
 
     def __init__(
         self, recording: Recording, detector: Callable | None, labels: str | Path | None, seed: int,
@@ -175,19 +175,19 @@ class _Work:
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
         self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
-        self.simulated: list[LabelledImage] = []  # in the colours of this recording
+        self.simulated: list[LabelledImage] = []  # simulated frames in the colours of this recording
         self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
         self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
         self.frames = np.union1d(spread(len(recording), _MOST_FRAMES), self.marked)
-        kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 5))]  # the others stop and judge
+        kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 5))]  # the rest count as unlabelled
         self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
-        self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
+        self.learns = isinstance(self.detector, Detector)  # other callables have no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
-        shown = (recording.frames[int(i)] for i in self.frames[::12])  # other images in the same folder are other work
+        shown = (recording.frames[int(i)] for i in self.frames[::12])  # changed images in the same folder need new work
         key += [recording.kinematics.time_s.tobytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in shown)]
         digest = getattr(self.detector, "digest", "")  # of the detector that learns
         key += [digest, Path(labels).read_bytes() if labels is not None else b""]
@@ -209,37 +209,37 @@ class _Work:
             print(line, end="" if done < 1 else "\n", file=sys.stderr, flush=True)
 
     def finished(self) -> dict:
-        """The report, with where and when it was made."""
+        """The report with its provenance."""
         return plain(self.provenance.so_far() | self.report)
 
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
-        """`look`, or what an earlier call kept."""
+        """Detections by `look`, or those that an earlier call kept under this name."""
         asked = SharedDetector(detector) if near is None and self.learns else detector
         return self.kept(name, partial(look, self.recording, asked, frames, near=near))
 
     def moving(self, seen: Seen, detector: Detector) -> Seen:
-        """`seen`, and other tools where those that it holds stand still while the robot moves."""
+        """`seen`; tools that stand still while the robot moves are replaced by other detections."""
         still = at_rest(seen, self.recording.landmarks_mm()[seen.frame])
         if not still.any() or not self.learns or detector.tool_network is None:
             return seen
         self.report["notes"].append(
-            f"In {still.sum()} of {still.size} images what the detector takes for the tool stands still while the robot "
-            "moves: it is another object, or a pattern. There the detector looked at what differs from the ground."
+            f"In {still.sum()} of {still.size} images the detected tool stands still while the robot moves: it is another "
+            "object, or a pattern. There detection was repeated only where the image differs from the ground."
         )
         return self.kept("elsewhere", partial(look_elsewhere, self.recording, detector, seen, still))
 
     def kept(self, name: str, find: Callable[..., Seen]) -> Seen:
-        """What `find` finds, or what an earlier call kept."""
+        """Detections by `find`, or those that an earlier call kept under this name."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            found = find(progress=partial(self.say, f"Looking ({name})"))
+            found = find(progress=partial(self.say, f"Detecting ({name})"))
             with files.whole(path) as new:
                 np.savez(new, **found._asdict())
         with np.load(path) as kept:
             return Seen(*(kept[field] for field in Seen._fields))
 
     def images(self, frames: np.ndarray, teacher: Teacher, seen: Seen | None) -> list[LabelledImage]:
-        """Left and right images with their labels, those that have a base and a tip."""
+        """Left and right images with the teacher's labels, if these include the base and a tip."""
         found = []
         for number, *labels in zip(frames, *teacher.labels(frames, seen), strict=True):
             frame = self.recording.frames[int(number)]
@@ -251,7 +251,7 @@ class _Work:
         return found
 
     def adapted(self) -> Adaptation:
-        """Teach, train and look again, round after round, then judge."""
+        """Teach, train and detect again, in rounds, then judge."""
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
         seen = self.moving(first, start)
@@ -259,7 +259,7 @@ class _Work:
         still, note = longest_still(recording, seen.labelled(self.labels if len(self.marked) < _OVERRULE else nothing))
         self.report["notes"] += [note] if note else []
         self.labels[np.setdiff1d(self.frames, still)], self.marked = np.nan, np.intersect1d(self.marked, still)
-        # Few labels only take the place of what was detected there.
+        # Few labels only replace the detections of their landmarks.
         by_hand, few = (None, self.labels) if len(self.marked) < _OVERRULE else (Seen.by_hand(self.labels), nothing)
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
@@ -267,21 +267,21 @@ class _Work:
         try:
             teacher = teach(recording, seen.labelled(few).of(learn), by_hand=by_hand)
             if self.contradicted(teacher):
-                raise RefusalError("labels: they lie elsewhere than where detector and robot agree; check both.")
+                raise RefusalError("labels: detector and robot agree with each other, but not with the labels; check both.")
         except RefusalError:
             if by_hand is None:
                 raise
             teacher = teach(recording, None, by_hand=by_hand)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
-        for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
+        for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untrained, near the robot's landmarks
             guided = self.look(f"guided {k}", start, learn, u)
             try:
                 found = teach(recording, guided.labelled(few), opinion=guided, before=teacher, by_hand=by_hand)
             except RefusalError:
                 if by_hand is None:
                     raise
-                break  # a detector that does not know the tool corrects nothing; labels set by hand do
+                break  # a detector that does not know the tool cannot improve on labels set by hand
             if self.contradicted(found):
                 break
             teacher = found
@@ -298,19 +298,19 @@ class _Work:
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
             tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
-            seen, said = self.look(f"round {k}", tuned, self.frames), {}
+            seen, refusal = self.look(f"round {k}", tuned, self.frames), {}
             try:
                 part = seen.labelled(few).of(learn)
                 found = teach(recording, part, before=teacher, opinion=guided, by_hand=by_hand)
                 new = teacher if self.contradicted(found) else found
             except RefusalError as refused:
-                said = {"refused": str(refused)}
+                refusal = {"refused": str(refused)}
                 if by_hand is None:
-                    rounds.append({"round": k} | said)
+                    rounds.append({"round": k} | refusal)
                     break
-                new = teacher  # what the labels say still holds
+                new = teacher  # which rests on labels set by hand
             now = agreement(new, seen.of(parts["stop"])).summary()
-            rounds.append({"round": k, "right": new.right} | now | said)
+            rounds.append({"round": k, "right": new.right} | now | refusal)
             last = now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]
             if now["mean_share"] <= (1 + _LEAST_GAIN) * stop["mean_share"]:
                 best, best_seen, teacher, stop = tuned, seen, new, now
@@ -319,34 +319,34 @@ class _Work:
         return self.judged(first, best, best_seen, teacher)
 
     def contradicted(self, teacher: Teacher) -> bool:
-        """Whether a teacher puts the landmarks elsewhere than labels set by hand do."""
-        told = self.labels[self.marked]
-        off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1)
-        off /= np.maximum(_OFF_LABELS * tool_length_px(told), _OFF_LABELS_PX)[..., None]
+        """True if a teacher's landmarks are too far from labels set by hand."""
+        labels = self.labels[self.marked]
+        off = np.linalg.norm(teacher.project(self.marked)[0] - labels, axis=-1)
+        off /= np.maximum(_OFF_LABELS * tool_length_px(labels), _OFF_LABELS_PX)[..., None]
         return len(self.marked) >= _OVERRULE and np.nanmedian(off) > 1
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
-        """The detector trained further on what the teacher says of the frames for learning."""
+        """The detector trained further on the teacher's labels of the frames for learning."""
         path, parts = self.folder / f"round {k}.safetensors", self.parts
         if path.is_file():
             return Detector.load(path, engine=detector.engine)
         held_out = self.images(parts["stop"], teacher, seen)
         doubt_on = parts["learn"][:0]
-        if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
+        if len(held_out) < _DOUBT_IMAGES:  # frames that were trained on do not show the errors in others, so hold out more
             doubt_on = parts["learn"][3::4]
             held_out += self.images(doubt_on, teacher, seen)
-        # The robot's labels err alike in all frames, and the networks learn that error: it is no noise of held-out labels.
+        # The robot's labels have the same error in all frames.  The networks learn it, so it is no noise of held-out labels.
         held_out = [one._replace(sd_px=0.0) for one in held_out]
         images = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
-            raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
+            raise RefusalError(f"robot: it labels {len(images)} images to train on, {len(held_out)} others; 8 and 4 suffice.")
         done = {}
 
         def progress(stage: str, part: float) -> None:
             done[stage] = part
             shares = ", ".join(f"{name} {100 * one:.0f} %" for name, one in sorted(done.items()))
             self.say(f"Round {k} ({shares})", min(sum(done.values()) / len(detector.networks), 1.0))
-            if time.perf_counter() - self.saved_s > 30:  # what a kill loses of the time spent
+            if time.perf_counter() - self.saved_s > 30:  # so that a kill loses little of the time count
                 self.saved_s = time.perf_counter()
                 files.write_json(self.folder / "state.json", {"seconds": self.saved_s - self.began})
 
@@ -360,7 +360,7 @@ class _Work:
         return tuned
 
     def judged(self, first: Seen, best: Detector, best_seen: Seen, teacher: Teacher) -> Adaptation:
-        """Compare the detectors on the frames that took no part."""
+        """Compare both detectors on the frames for judging, which took no part in teaching or stopping."""
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements = [agreement(teacher, own) for own in seen]
         distances = epipolar_px(self.recording, seen, best_seen.of(self.parts["learn"]))
@@ -372,14 +372,14 @@ class _Work:
         reasons = {
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than its standard deviation": not robot > _SURE_GAIN * robot_sd,
-            "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
+            "left and right of the frames for judging, independently of the robot, do not agree better": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
         }
         labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
         self.report["notes"].append(
-            "Where the robot puts the landmarks in the images has standard deviations of "
+            "The robot's labels in the images have standard deviations of "
             f"{', '.join(f'{sd:.1f}' for sd in labels_sd_px)} px ({', '.join(LANDMARKS)}). Most of that error is the same in "
-            "all frames: agreement with the robot does not show it."
+            "all frames, so the agreement with the robot does not show it."
         )
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),
@@ -393,8 +393,8 @@ class _Work:
             "landmark_offset_sd_mm": np.sqrt(np.diagonal(teacher.offset_covariance_mm2, axis1=1, axis2=2)),
             "landmark_offset_turns_axes": teacher.turns,
             "labels_sd_px": labels_sd_px,
-            "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the deviations leave it out. "
-            "An offset of the robot and a constant error of the detector look alike, too; labels set by hand tell.",
+            "gauge": "An offset that all landmarks share looks like a shift of the cameras; the standard deviations do not "
+            "include it. A robot's offset looks like a constant error of the detector; labels set by hand distinguish them.",
         }  # fmt: skip
         if improved and self.learns:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
@@ -405,12 +405,12 @@ class _Work:
 
 
 def _work_folder(folder: str | Path | None, name: str, key: list) -> Path:
-    """Where an adaptation keeps what it has done: a folder of its own for each `key`."""
+    """The folder of an adaptation's intermediate results, a separate one for each `key`."""
     return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / files.digest(repr(key).encode())
 
 
 def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:
-    """Simulated frames in the colours of some images, so that what others look like is not forgotten; kept in the cache."""
+    """Simulated frames in the colours of some images, which keep the networks from forgetting others; kept in the cache."""
     folder = paths.CACHE / "adapt" / "simulated"
     generate(folder, "held_out", _SIMULATED_SHARDS, progress=progress)
     pixels = (cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3) for image in images)

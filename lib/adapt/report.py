@@ -1,4 +1,4 @@
-"""``python3 -m lib adapt RECORDING``: weights, if the adaptation improved them, and one page that says what was done."""
+"""``python3 -m lib adapt RECORDING``: writes new weights, if they are better, and a page that reports what was done."""
 
 import argparse
 import shlex
@@ -15,18 +15,18 @@ from lib.trust.check import data_uri, overlay
 
 _NUMBERS = {
     "median_px": "median distance from the robot, px",
-    "median_sigmas": "the same in stated standard deviations (0.8 is right)",
+    "median_sigmas": "the same in stated standard deviations (0.8 if these are right)",
     "within_1_percent": "within 1 % of the tool's length, %",
     "within_5_percent": "within 5 %, %",
     "within_10_percent": "within 10 %, %",
-    "epipolar_px": "median distance of left and right from epipolar lines, px",
+    "epipolar_px": "median epipolar distance between left and right, px",
 }
 
 
 def write(found: Adaptation, folder: str | Path, recording: Recording | None = None) -> Path:
-    """Write report.json, report.html and, if improved, weights.safetensors with its card into `folder`; returns the page.
+    """Write report.json, report.html and, if improved, weights.safetensors and weights.md into `folder`.
 
-    `recording` gives the pictures of the best, the median and the worst frame for judging.
+    Returns the path of report.html.  With `recording` it shows the best, the median and the worst frame for judging.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -35,7 +35,7 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
         found.detector.save(folder / "weights.safetensors")
         files.write_text(folder / "weights.md", here.get_template("weights.md").render(r=found.report, numbers=_NUMBERS))
     elif (folder / "weights.safetensors").exists():
-        found.report["notes"] = [*found.report["notes"], "weights.safetensors in this folder is of an earlier run."]
+        found.report["notes"] = [*found.report["notes"], "weights.safetensors in this folder is from an earlier run."]
     files.write_json(folder / "report.json", found.report)
     pictures = [] if recording is None or found.after is None else _pictures(found, recording)
     page = here.get_template("adapt.html").render(r=found.report, numbers=_NUMBERS, pictures=pictures)
@@ -44,28 +44,28 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
 
 
 def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
-    """(caption, picture) of frames for judging, before above after: the best, the median and the worst after."""
+    """(caption, picture) of the best, the median and the worst frame for judging, each before (above) and after (below)."""
     order = np.argsort(found.after.relative)[: np.isfinite(found.after.relative).sum()]
     pictures = []
     for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True) if len(order) else ():
         number = int(found.frames["judge"][order[i]])
         rows = [overlay(recording.frames[number], own.u[order[i]], found.told[order[i]], 520) for own in found.seen]
         share = 100 * found.after.relative[order[i]]
-        caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above before, below after."
+        caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above: before. Below: after."
         pictures.append((caption, data_uri(np.vstack(rows), ".jpg")))
     return pictures
 
 
 def main(argv: list[str]) -> int:
-    """`python3 -m lib adapt`; exit code 0 where the weights improved, 3 where they were left alone, 2 for bad input."""
+    """`python3 -m lib adapt`; exit code 0 if the weights improved, 3 if they were left unchanged, 2 for bad input."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib adapt", description="Let the robot of a recording teach the detector its landmarks."
     )
     add = parser.add_argument
-    add("recording", type=Path, help="a recording; or a folder of images, which --labels names")
-    add("--labels", type=Path, metavar="FILE", help="COCO keypoints, as annotations.json: 10 labelled pairs are a good start")
-    add("--minutes", type=float, default=20.0, help="of training (default: 20)")
-    add("--out", type=Path, metavar="FOLDER", help="of weights, report.json and report.html (default: runs/adapt-NAME)")
+    add("recording", type=Path, help="a recording; or a folder of images that --labels names")
+    add("--labels", type=Path, metavar="FILE", help="COCO keypoints like annotations.json: 10 pairs are a good start")
+    add("--minutes", type=float, default=20.0, help="minutes of training (default: 20)")
+    add("--out", type=Path, metavar="FOLDER", help="for weights, report.json and report.html (default: runs/adapt-NAME)")
     add("--weights", metavar="FILE", help="the detector to start from (default: the one that ships)")
     add("--seed", type=int, default=0)
     a = parser.parse_args(argv)

@@ -1,7 +1,7 @@
-"""From half-wrong detections to labels: cameras that the right ones agree on, and the robot's landmarks seen through them.
+"""From half-wrong detections to labels: calibrate cameras with the inliers, and project the robot's landmarks through them.
 
-What the robot says is refused where its log stands still, where the image shows the whole tool elsewhere, and altogether
-where a fault of clock, axes or tool explains what the images show.
+The robot's report is refused in frames in which its log stands still or the image shows the whole tool elsewhere.  It is
+refused altogether if a fault of clock, axes or tool explains what the images show.
 """
 
 import warnings
@@ -27,41 +27,41 @@ from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.diagnosis import stated
 from lib.trust.fitting import Problem
 
-#: Least share of the landmarks that must agree on the cameras, and of the views of one that show it where the robot says;
-#: fewest landmarks in number, and the share that needs no other try.
+#: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
+#: the share from which no other threshold is tried.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
-#: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.
+#: Faults that disqualify the robot as a teacher; and the least share of the residuals that they must explain.
 FAULTS = {
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
     "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
     "zoom_varies", "time_stamps", "backlash", "odd_pixels",
 }  # fmt: skip
 _EXPLAINED = 0.15
-#: Residuals below this share of the tool's length hold no fault that matters, however well one explains them.
+#: Residuals below this share of the tool's length are harmless, whatever fault explains them.
 _HARMLESS = 0.01
-#: Share of the frames in which the images may show the whole tool elsewhere than the robot.
+#: Largest share of the frames in which the images may contradict the robot.
 _CONTRADICTED = 0.2
-#: The base has no edge that ends along the shaft: a detector's own error there, as a multiple of the deviation that it states,
-#: if that is more than its `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools by two other renderers as well.
+#: The base has no edge that ends along the shaft.  A detector's constant error there is this multiple of its stated standard
+#: deviation, if that exceeds `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools, also by two other renderers.
 _BASE_BIAS = 2.0
-#: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
-#: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm, however short the tool.
+#: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
+#: standard deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm even for short tools.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
-#: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
+#: Relative error of an offset if the tool's axes of shut jaws are taken from a time farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
-_TURNS_S = 0.02  # between samples of the log that show how jaws turn; more are not worth their time
-#: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
-#: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
+_TURNS_S = 0.02  # between the samples of the log from which axes are taken; shorter steps are not worth their time
+#: Least gain in log likelihood per detection by separate cameras for two parts of the time, if the cameras moved.  A smaller
+#: gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks can do, too.
 _SURE_MOVE = 0.5
-#: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
+#: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.
 _LARGEST_STEP_S = 0.03
-_HELD_S = 0.12  # so long a log may repeat a sample that the robot has not renewed
-_BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
+_HELD_S = 0.12  # a log may repeat a sample for this long, until the robot renews it
+_BEHIND = 0.1  # least distance from the camera of a visible point, as a share of the working distance
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-#: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
+#: Fewest labelled pairs that determine outliers and offsets; with fewer, the standard deviation of a robot's usual offsets.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
-_POOR = (DataError, np.linalg.LinAlgError)  # what data end in that tell too little; other errors are of the program
-_OTHER_POINT = 0.3  # from a detector's point to the labelled one, standard deviation, as a share of the tool's length
+_POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
+_OTHER_POINT = 0.3  # prior sd of the offset from a detector's point to the labelled one, as a share of the tool's length
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -69,11 +69,11 @@ _LABEL = (
 
 
 class RefusalError(DataError):
-    """The recording cannot teach; the text says why, and what to do."""
+    """The recording cannot teach; the message states why, and what to do."""
 
 
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
-    """The frames before or after the cameras moved, whichever are more, and what to say of it; all if they did not."""
+    """The frames before or after the cameras moved, whichever are more, and a note; all frames and "" if they did not."""
     rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
     rows = rows.subset(np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1))
     problem = Problem.of(rows, recording.image_size_px)
@@ -84,7 +84,7 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     first = np.unique(rows.frame)[problem.other_cameras(fit)[0]]
     parts = frames[frames < first], frames[frames >= first]
     own = sum(Problem.of(rows.of_frames(part), recording.image_size_px).fit().total for part in parts)
-    # Cameras of their own have 16 numbers more, and the cut could lie anywhere.  Few frames fit some by chance.
+    # Separate cameras have 16 parameters more, and 12 allows for the choice of the cut.  Few frames may fit by chance.
     if min(map(len, parts)) < 0.15 * len(frames) or own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
@@ -94,25 +94,25 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
 
 @dataclass(frozen=True, eq=False)
 class Teacher:
-    """The robot's landmarks, seen through calibrated cameras.
+    """The robot's landmarks, projected through calibrated cameras.
 
-    `offset_mm` (3, 3), in the tool's axes, says where the landmarks are beside where the robot reports them;
-    `offset_covariance_mm2` (3, 3, 3) is that of each landmark.
+    `offset_mm` (3, 3), in the tool's axes, leads from the robot's report of each landmark to the landmark;
+    `offset_covariance_mm2` (3, 3, 3) is the covariance of each landmark's offset.
     """
 
-    recording: Recording  # with the clock's offset as the images show it
+    recording: Recording  # with the clock's offset as estimated from the images
     calibration: Calibration
     clock_sd_s: float
     offset_mm: np.ndarray
     offset_covariance_mm2: np.ndarray
     refused: np.ndarray  # frames in which the robot is not believed
-    right: float  # share of the landmarks that agree on the cameras
+    right: float  # share of inliers among the landmarks
     turns: bool = False  # as `LandmarkOffsets.turns`
 
     def project(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
 
-        NaN where the robot is silent.  The covariance is that of calibration, robot, clock and offset.
+        NaN where the robot is silent.  The covariance includes calibration, robot, clock and offset.
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
         time = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s
@@ -122,18 +122,18 @@ class Teacher:
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
-                if side == 0 or r.readout_s:  # else both images are of the same instants
+                if side == 0 or r.readout_s:  # else both images belong to the same instants
                     x = r.kinematics.at(at)
-                    when_s = np.append(log_s[log], at[:, 0])  # the log shows how shut jaws were turned before
+                    when_s = np.append(log_s[log], at[:, 0])  # shut jaws take their axes from other samples of the log
                     order = np.argsort(when_s)
-                    told = np.concatenate([r.kinematics.x_mm[log], x])[order]
-                    known = tool_axes(told, offset if self.turns else None)
-                    axes = np.nan_to_num(carried(known, told, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
+                    path = np.concatenate([r.kinematics.x_mm[log], x])[order]
+                    known = tool_axes(path, offset if self.turns else None)
+                    axes = np.nan_to_num(carried(known, path, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
                     apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
                     shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
                     moved_mm = x + np.einsum("mij,kj->mki", axes, offset)
                 x = moved_mm.copy()
-                if isinstance(camera, NearAffineCamera):  # what the robot parks behind a camera is seen nowhere
+                if isinstance(camera, NearAffineCamera):  # points behind a camera are not visible
                     x[camera.depth_ratio(x.reshape(-1, 3)).reshape(x.shape[:2]) < _BEHIND] = np.nan
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
                 at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (r.image_size_px[1] - 1) - 0.5).clip(-0.5, 0.5)
@@ -151,8 +151,8 @@ class Teacher:
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u, covariance (as `project`) and visibility (m, 2, 3) of some frames; NaN where the robot is silent or refused.
 
-        Outside the image a landmark is 0, absent.  It is 1, hidden, where `seen`, of a detector that knows the tool, finds
-        the two others where they should be and this one not.
+        Visibility is 0 outside the image.  It is 1 (hidden) if `seen`, by a detector that knows the tool, has the two other
+        landmarks in the right place but not this one.  Otherwise it is 2.
         """
         u, covariance = self.project(frames)
         u = np.where(np.isin(frames, self.refused)[:, None, None, None], np.nan, u)
@@ -168,18 +168,18 @@ def teach(
     recording: Recording, seen: Seen | None, *, opinion: Seen | None = None, before: Teacher | None = None,
     by_hand: Seen | None = None,
 ) -> Teacher:  # fmt: skip
-    """The robot as the teacher of what a detector has `seen` in the frames for learning.
+    """The teacher by a robot and by the detections `seen` in the frames for learning.
 
     Args:
-        seen: None where labels set by hand, of few frames, have to do.
-        opinion: Of later stages that this robot never taught.  They tell the landmarks' offsets; None: `seen` does.
-        before: The teacher of the round before: its clock is the start, and what it refused stays refused.
-        by_hand: Labels set by hand.  They tell the offsets in place of detections, which may be of other points of the tool.
+        seen: None uses only the labels `by_hand`, of few frames.
+        opinion: Detections by later stages that this robot never taught, which give the landmarks' offsets; else `seen` does.
+        before: The teacher of the round before: its clock is the start, and frames that it refused stay refused.
+        by_hand: Labels set by hand.  They determine the offsets, since detections may show other points of the tool.
 
     Raises:
-        RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
-            a landmark is seen more than 15 % of the tool's length and 0.25 mm off, its place stays open by more than 10 %, or
-            the robot contradicts the images.
+        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the cameras are not those of a stereo
+            microscope; a landmark is seen more than 15 % of the tool's length and 0.25 mm off; the standard deviation of its
+            label exceeds `NEAR` of the tool's length; or the robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
     refused = _frozen(recording, seen.frame)
@@ -187,7 +187,7 @@ def teach(
         recording, refused = before.recording, np.union1d(refused, before.refused)
     used = seen.of(np.setdiff1d(seen.frame, refused))
     if len(used.frame) < 5:
-        raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
+        raise RefusalError(f"kinematics: the log stands still in {len(refused)} of {len(seen.frame)} frames; check it.")
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
@@ -203,11 +203,11 @@ def teach(
             k = int(sure_mm.argmax())
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
-                f"{100 * size_mm[k] / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool "
-                f"has other dimensions. {_LABEL}"
+                f"{100 * size_mm[k] / length:.0f} % of the tool's length. It marks another point, or the robot's tool has "
+                f"other dimensions. {_LABEL}"
             )
         if fault is not None and not (alone or clicked):
-            raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector takes other points for the tips. {_LABEL}")
+            raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {_LABEL}")
         turns = told.turns
         own = 0.2 * OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
         offset, covariance = robots_part(told, own * length)
@@ -220,24 +220,24 @@ def teach(
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
     if share > NEAR:
         what = "labels" if alone else "detections"
-        raise RefusalError(f"{what}: they tell a landmark's place to {100 * share:.0f} % of the tool's length only. {_LABEL}")
+        raise RefusalError(f"{what}: they leave an error of {100 * share:.0f} % of the tool's length (sd). {_LABEL}")
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
             f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool elsewhere than the robot "
-            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
+            f"reports: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
 
 
 def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> LandmarkOffsets | None:
-    """The offsets that later stages see; a `RefusalError` where they hardly see a landmark near where the robot says."""
+    """The offsets by later stages; a `RefusalError` if these hardly detect a landmark near where the robot reports it."""
     shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
     if shares.min() < LEAST_RIGHT * shares.max():
         rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
         raise RefusalError(
-            f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
-            f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
+            f"detector: near the robot's report it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
+            f"{100 * shares.max():.0f} %. It marks another point for {rare}. {_LABEL}"
         )
     with suppress(*_POOR):
         return _placed(recording, opinion.of(frames)).offsets
@@ -245,7 +245,7 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
 
 
 def _own_bias(seen: Seen) -> np.ndarray:
-    """Standard deviations (3, 3) of a detector's own constant errors, as `OWN_BIAS`, from how sure it is of the base."""
+    """Standard deviations (3, 3) of a detector's constant errors: `OWN_BIAS`, and more if it is unsure of the base."""
     along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
     stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
     own = OWN_BIAS.copy()
@@ -254,13 +254,13 @@ def _own_bias(seen: Seen) -> np.ndarray:
 
 
 def _length_mm(recording: Recording) -> float:
-    """Of the tool, from its base to the middle of its tips."""
+    """Median length of the tool, from its base to the middle of its tips."""
     x = recording.landmarks_mm()
     return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
 
 
 def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
-    """Frames at which the robot's log repeats itself to the last digit for longer than `_HELD_S`, or is silent."""
+    """The frames in which the robot's log repeats one sample to the last digit for longer than `_HELD_S`, or is silent."""
     k = recording.kinematics
     same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
     first = np.append(np.flatnonzero(~same), len(same))  # samples that differ from the one before
@@ -272,17 +272,16 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
 def _aligned(
     recording: Recording, seen: Seen, *, by_hand: bool
 ) -> tuple[Recording, Calibration, Hypothesis | None, float, float]:
-    """The recording with the clock's offset that cameras tell, the cameras, the offset's deviation, the share that agrees.
+    """The recording with its clock corrected, the cameras, a fault or None, the clock's sd in s, the share of inliers.
 
-    Third is a fault that may be the detector's as well: jaws of another opening.
-
-    A `RefusalError` where no cameras of a stereo microscope explain what is seen (or marked, if `by_hand`), or a fault does.
+    The fault is a wrong opening of the jaws, which may also be the detector's.  A `RefusalError` if no cameras of a stereo
+    microscope explain the detections (or labels, if `by_hand`), or if another fault explains them.
     """
     calibrated = partial(_by_labels if by_hand else _by_detections, seen=seen)
     recording, clock_sd_s = _clock(recording, seen, by_hand=by_hand)
     try:
         calibration = calibrated(recording)
-    except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
+    except RefusalError as error:  # perhaps the clock is so far off that too few inliers are left to estimate it
         if error.__cause__ is not None:
             raise
         recording = _scanned_clock(recording, lambda one: _fitted(one, seen).view_inliers.sum())
@@ -290,7 +289,7 @@ def _aligned(
         calibration = calibrated(recording)
     for _ in range(2):
         step_s, sd_s = clock_error(calibration, seen.rows(recording), recording.kinematics, recording.offset_s)
-        surer = sd_s <= 1.1 * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan of few pairs states no deviation
+        surer = sd_s <= 1.1 * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan with few pairs gives no sd
         if np.isinf(sd_s) or not surer:
             break
         clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
@@ -307,13 +306,14 @@ def _aligned(
         calibration = calibrated(recording)
     if fault is not None and fault.name != "jaw_opening":
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
-    return recording, calibration, fault, clock_sd_s, float(calibration.view_inliers.sum() / max(_told(recording, seen), 1))
+    right = float(calibration.view_inliers.sum() / max(_reported(recording, seen), 1))
+    return recording, calibration, fault, clock_sd_s, right
 
 
 def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[Recording, float]:
-    """The recording with the offset of the clocks that the images show, if they do, and its standard deviation."""
+    """The recording with the clocks' offset as estimated from the images, if possible, and its standard deviation in s."""
     rows = seen.rows(recording)
-    if len(seen.frame) < _FEW_PAIRS:  # too few for that: the offset at which cameras explain the labels best
+    if len(seen.frame) < _FEW_PAIRS:  # too few for that: take the offset with the smallest residuals
         fit = _by_labels if by_hand else _fitted
         return _scanned_clock(recording, lambda one: -fit(one, seen).reprojection_rms_px), 0.01
     for reach_s in (0.2, 1.0):
@@ -328,9 +328,9 @@ def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[
 
 
 def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) -> Recording:
-    """The recording with the clock offset of the highest merit, of 21 within 0.2 s; `clock_error` tells the rest.
+    """The recording with the clock offset of highest merit among 21 within +-0.2 s; `clock_error` refines it later.
 
-    Of equal ones the smallest change; none where no offset gives cameras.
+    Equal merits prefer the smallest change.  Nothing changes if no offset gives cameras.
     """
     def merit_at(change_s: float) -> float:
         with suppress(*_POOR):
@@ -342,49 +342,49 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
 
 
 def _fitted(recording: Recording, seen: Seen, **more: float | bool) -> Calibration:
-    """Affine cameras of square pixels, which leave the landmarks' offsets the least room."""
+    """Calibrate affine cameras with square pixels, which leave the landmarks' offsets the least freedom."""
     return calibrate(seen.rows(recording), model="square", image_size_px=recording.image_size_px, **more)
 
 
 def _placed(recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None) -> Calibration:
-    """As `_fitted`, of a finite distance where the detections show one."""
+    """As `_fitted`, with a finite working distance if the detections show one."""
     how = {"models": ("square", "square+distance"), "image_size_px": recording.image_size_px, "ransac_px": ransac_px}
     return calibrate_as_shown(seen.rows(recording, least), **how)
 
 
 def _by_labels(recording: Recording, seen: Seen) -> Calibration:
-    """As `_placed`, from labels set by hand.  If they are few, all count as right, with a robot's usual offsets."""
+    """As `_placed`, from labels set by hand.  If they are few, all are inliers, and offsets have a robot's usual prior."""
     try:
         if len(seen.frame) >= _FEW_PAIRS:
             return _placed(recording, seen)
-        with warnings.catch_warnings(action="ignore", category=Unsettled):  # by a clock that is off
+        with warnings.catch_warnings(action="ignore", category=Unsettled):  # expected if the clock is off
             try:
                 return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
-            except _POOR:  # jaws that are shut have no axes
+            except _POOR:  # shut jaws have no axes
                 return _fitted(recording, seen, ransac_px=np.inf)
     except _POOR as error:
         raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
 
 
 def _by_detections(recording: Recording, seen: Seen) -> Calibration:
-    """Cameras that the detections agree on, the confident ones if all do not."""
-    told, length = _told(recording, seen), tool_length_px(seen.u)
+    """Calibrate with the detections, or if they do not agree on cameras, with the confident ones."""
+    reported, length = _reported(recording, seen), tool_length_px(seen.u)
     reason, best, poor, competing = "none was found", None, None, None
     near_px = NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
-    # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
-    rows_kept = {int((seen.confidence >= least).sum()): least for least in _CONFIDENCES[::-1]}  # as many are the same rows
+    # An unknown tool's offsets widen the errors of inliers, so that outliers may not stand apart: hence a last, wide gate.
+    rows_kept = {int((seen.confidence >= least).sum()): least for least in _CONFIDENCES[::-1]}  # equal counts are equal rows
     for least, ransac_px in (*((least, None) for least in sorted(rows_kept.values())), (MIN_CONFIDENCE, near_px)):
         if ransac_px is not None and competing:
-            break  # nothing tells which is the robot's
+            break  # it is unknown which of two cameras is right
         try:
             found = _placed(recording, seen, least, ransac_px)
         except _POOR as error:
             if ransac_px is None and (not competing or isinstance(error, CompetingCamerasError)):
-                reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
+                reason = str(error).partition(". ")[0].partition("; ")[0]  # without the cure, which is to adapt
             competing = error if isinstance(error, CompetingCamerasError) else competing
             continue
-        right = float(found.view_inliers.sum() / max(told, 1))
-        if found.view_inliers.sum() < max(LEAST_RIGHT * told, min(_FEWEST_RIGHT, 0.5 * told)):
+        right = float(found.view_inliers.sum() / max(reported, 1))
+        if found.view_inliers.sum() < max(LEAST_RIGHT * reported, min(_FEWEST_RIGHT, 0.5 * reported)):
             reason = f"only {100 * right:.0f} % of the landmarks agree on cameras, {found.view_inliers.sum()} in number"
         elif found.reprojection_rms_px < near_px:
             best = best if best and right < 1.5 * best[1] else (found, right)
@@ -397,13 +397,13 @@ def _by_detections(recording: Recording, seen: Seen) -> Calibration:
     raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}") from competing
 
 
-def _told(recording: Recording, seen: Seen) -> int:
-    """How many landmarks, of two views each, the robot reports in the frames of `seen`."""
+def _reported(recording: Recording, seen: Seen) -> int:
+    """The number of landmarks that the robot reports in the frames of `seen`, counted in both images."""
     return 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
 
 
 def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_hand: bool) -> Hypothesis | None:
-    """The robot's fault that explains what the images show, if there is one; cameras of no stereo microscope are refused."""
+    """The robot's fault that explains the detections, or None.  A `RefusalError` if no stereo microscope has such cameras."""
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
@@ -416,7 +416,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
-    """The teacher with the offsets at which its cameras see the robot's landmarks where labels set by hand are."""
+    """The teacher with offsets that are fitted to labels set by hand."""
     free = teacher.calibration.offsets
     fitted = free is not None and free.offset.shape == (3, 3)
     teacher = replace(teacher, turns=fitted and free.turns)
@@ -428,17 +428,17 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
         return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), change)
 
     known = np.isfinite(labels.u)
-    # A wild click counts little.
+    # The robust loss limits the influence of gross errors.
     found = least_squares(misfit, np.zeros(9), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
     covariance = wide_mm**2 * max(1.0, 2 * found.cost / known.sum()) * np.linalg.inv(found.jac.T @ found.jac)
-    told = known.any(axis=(0, 1, 3))[:, None]  # of other landmarks the labels say nothing
-    offset = np.where(told, (start + wide_mm * found.x).reshape(3, 3), teacher.offset_mm)
-    own = np.where(told[:, :, None], np.einsum("kikj->kij", covariance.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
+    marked = known.any(axis=(0, 1, 3))[:, None]  # the other landmarks keep their offsets
+    offset = np.where(marked, (start + wide_mm * found.x).reshape(3, 3), teacher.offset_mm)
+    own = np.where(marked[:, :, None], np.einsum("kikj->kij", covariance.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
     return replace(teacher, offset_mm=offset, offset_covariance_mm2=own)
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
-    """Frames in which two landmarks and more are seen in both images, by one and the same distance off the robot's report."""
+    """The frames in which at least two landmarks are far from the robot's report by the same shift, in both images."""
     free = teacher.calibration.offsets
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)

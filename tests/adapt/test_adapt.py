@@ -555,7 +555,7 @@ def test_labels_that_leave_the_places_open_are_refused(world, recording, tmp_pat
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
     lost = StandIn(world.u, wrong=0.97)
     found = adapt(recording, lost, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=pupil(world))
-    assert re.search("labels: .* to [0-9]+ % of the tool's length only. Label 10 pairs", found.report["reason"])
+    assert re.search(r"labels: .* error of [0-9]+ % of the tool's length \(sd\). Label 10 pairs", found.report["reason"])
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
@@ -674,7 +674,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "worse" / "weights.safetensors").exists()
     assert "Left alone" in capsys.readouterr().out
     assert report.main([str(recording.folder), "--out", str(out)]) == 3
-    assert "weights.safetensors in this folder is of an earlier run" in capsys.readouterr().out
+    assert "weights.safetensors in this folder is from an earlier run" in capsys.readouterr().out
 
 
 def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
