@@ -12,7 +12,7 @@ from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
-#: A detected tool stands still if it is within this share of its length of the same place in at least so many frames.
+#: A detected tool stands still if it is in the same place, within this share of its length, in at least 4 frames.
 _STILL, _STILL_FRAMES = 0.15, 4
 
 

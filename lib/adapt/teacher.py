@@ -191,16 +191,16 @@ def teach(
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
-    told, turns = calibration.offsets, False
+    offsets, turns = calibration.offsets, False
     offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:
-        told = _opinion(recording, opinion, used.frame)
-    if told is not None and told.offset.shape == (3, 3):
+        offsets = _opinion(recording, opinion, used.frame)
+    if offsets is not None and offsets.offset.shape == (3, 3):
         length = _length_mm(recording)
-        size_mm = np.linalg.norm(told.offset, axis=1)
-        sure_mm = size_mm - 2 * np.linalg.norm(told.standard_deviation * told.offset, axis=1) / np.maximum(size_mm, 1e-9)
-        if sure_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
-            k = int(sure_mm.argmax())
+        size_mm = np.linalg.norm(offsets.offset, axis=1)
+        sd_mm = np.linalg.norm(offsets.standard_deviation * offsets.offset, axis=1) / np.maximum(size_mm, 1e-9)
+        if (low := size_mm - 2 * sd_mm).max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
+            k = int(low.argmax())
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It marks another point, or the robot's tool has "
@@ -208,9 +208,9 @@ def teach(
             )
         if fault is not None and not (alone or clicked):
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {_LABEL}")
-        turns = told.turns
+        turns = offsets.turns
         own = 0.2 * OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
-        offset, covariance = robots_part(told, own * length)
+        offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)

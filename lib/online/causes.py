@@ -1,4 +1,4 @@
-"""Why do images and robot disagree?  Each cause fits a few numbers to the frames since; the likeliest wins."""
+"""Why images and robot disagree.  Each cause is fitted with a few parameters to the frames since; the likeliest wins."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,39 +11,39 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.registration import MovedCameras, identify_motion
 
-#: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
+#: Largest mean loss, 8 log(1 + chi^2 / 4), of rows that a rig explains.  About 5.1 is expected, 10 with 1.7 times the noise.
 CONVINCING = 10.0
-_LATEST, _LATEST_EYE = 25, 5  # frames by which a report, and the images of one camera, may be late
+_LATEST, _LATEST_EYE = 25, 5  # largest delays in frames: of the report or both images, and of one camera's images
 _CROSSED = [0, 2, 1]  # rows of a frame with the tips exchanged
 _LEAST_ZOOM = 0.01  # a smaller change of a camera's zoom, found in few frames, may be noise
-_PLAIN = 10.0  # by how much less likely the motion of a camera must be than any other cause
-_OPEN = 40.0  # the same, for a tool that glides: a late report and a shift of the cameras then look alike at first
-_ROBUST = 12.0  # squared residual in standard deviations that begins to count less
+_SURE = 10.0  # loss by which another cause must beat a motion of the cameras
+_UNDECIDED = 40.0  # loss by which a delay may exceed a motion and stay possible: at first both look alike if the tool glides
+_ROBUST = 12.0  # squared Mahalanobis distance at which the weight of a row is one half
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The likeliest cause: "none", "moved", "optics", "exchanged", "clock", "eye" (is late), "slipped" or "open"."""
+    """The likeliest cause; `kind` is "none", "moved", "optics", "exchanged", "clock", "eye", "slipped" or "open"."""
 
-    kind: str
-    text: str = ""  # what happened, where it is no motion
-    rig: StereoRig | None = None  # that explains the landmarks
+    kind: str  # "clock": report or images are late; "eye": images of one camera are late; "open": not decided yet
+    text: str = ""  # what happened; empty for a motion
+    rig: StereoRig | None = None  # the rig that explains the landmarks
     motion: MovedCameras | None = None
-    loss: float = float("nan")  # of a row, the mean over the rows; see `CONVINCING`
+    loss: float = float("nan")  # mean over the rows; see `CONVINCING`
 
 
 def explain(
     rig: StereoRig, frames: Sequence[Correspondences], past: Sequence[Correspondences], covariance_px2: np.ndarray, *,
     undecided: bool = True,
 ) -> Explanation:  # fmt: skip
-    """The likeliest cause of what `frames` show; a ValueError if the landmarks leave every motion open.
+    """The likeliest cause of a disagreement between images and robot; a ValueError if the rows determine no motion.
 
     Args:
-        rig: In force before.
+        rig: The rig before the disagreement.
         frames: Frames that disagree with it, 3 rows each, oldest first.
-        past: Some twenty frames up to the newest of `frames`, and those themselves.
+        past: The frames before, up to the newest of `frames`, in which delayed reports and images are sought.
         covariance_px2: (n, 4, 4) of the complete rows' residuals.
-        undecided: More frames may come: answer "open" where a motion and a late report explain these about equally well.
+        undecided: Return "open" if a motion and a delay explain the frames about equally well, since more frames may come.
     """
     data = Correspondences.join(frames).complete
     motion = identify_motion(rig, data, covariance_px2=covariance_px2)
@@ -54,7 +54,7 @@ def explain(
     crossed = (replace(part, u_left=part.u_left[_CROSSED], u_right=part.u_right[_CROSSED]) for part in frames)
     if len(crossed := Correspondences.join(crossed).complete) == len(data):
         others.append((misfit(rig, crossed, covariance_px2), Explanation("exchanged", "the tips are exchanged", rig)))
-    late = _lateness(rig, frames, past, covariance_px2)
+    late = _delays(rig, frames, past, covariance_px2)
     others += late
     axes = rows_axes(data)
     if np.isfinite(axes).all():
@@ -75,14 +75,14 @@ def explain(
     best, other = min(others, key=lambda pair: pair[0])
     penalty = {"slipped": 3, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
-    near = min((value for value, _ in late), default=np.inf) - least <= _OPEN
-    if undecided and found.kind == "moved" and near and best >= least - _PLAIN:
+    near = min((value for value, _ in late), default=np.inf) - least <= _UNDECIDED
+    if undecided and found.kind == "moved" and near and best >= least - _SURE:
         return Explanation("open", "the cameras moved, or the report or an image is late: not decided yet")
-    return other if best < least - _PLAIN else found
+    return other if best < least - _SURE else found
 
 
 def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, parameters: int = 0) -> float:
-    """How badly a rig explains complete rows, as the information criteria of `identify_motion` say it.
+    """The loss of complete rows with a rig, comparable with the information criteria (BIC) of `identify_motion`.
 
     The residuals' covariance is (n, 4, 4), and `parameters` is the number of values that were fitted to these rows.
     """
@@ -94,8 +94,8 @@ def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, pa
     return float(8.0 * np.log1p(chi2 / 4.0).sum() + parameters * np.log(4.0 * len(data)))
 
 
-def _lateness(rig, frames, past, covariance_px2) -> list[tuple[float, Explanation]]:
-    """How badly delays of the report, of the images, or of one camera's images explain the frames."""
+def _delays(rig, frames, past, covariance_px2) -> list[tuple[float, Explanation]]:
+    """The loss and explanation for each possible delay of the report, of the images, or of one camera's images."""
     number, found = {int(part.frame[0]): part for part in (*past, *frames)}, []
     now = Correspondences.join(frames)
     for delay in range(1, _LATEST + 1):
@@ -117,7 +117,7 @@ def _lateness(rig, frames, past, covariance_px2) -> list[tuple[float, Explanatio
 
 
 def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
-    """(3,) mm in the tool's axes by which all landmarks lie off the report, robustly."""
+    """The common offset (3,) mm of all landmarks from the report, in the tool's axes, by robust least squares."""
     y, weight, offset = data.stacked_px, np.linalg.inv(covariance_px2), np.zeros(3)
     for _ in range(10):
         x = data.x_mm + axes @ offset
@@ -128,7 +128,7 @@ def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_
 
 
 def _zoomed(camera: AffineCamera, x_mm: np.ndarray, u: np.ndarray, covariance_px2: np.ndarray) -> tuple[AffineCamera, float]:
-    """The camera with its image scaled and shifted so that x_mm is seen at u, robustly; and that scale."""
+    """The camera with its image scaled and shifted to see x_mm at u, by robust least squares; and the scale."""
     variance, weight, seen = np.einsum("nii->n", covariance_px2) / 4.0, np.ones(len(u)), camera.project(x_mm)
     for _ in range(10):
         share = (weight / variance / (weight / variance).sum())[:, None]

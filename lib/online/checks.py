@@ -1,4 +1,4 @@
-"""Is a frame fit to be used?  What images and report tell by themselves, before any rig is asked."""
+"""Whether a frame is usable, judged by the images and the robot's report alone, without a rig."""
 
 import cv2
 import numpy as np
@@ -6,11 +6,11 @@ import numpy as np
 from lib.correspondences import Correspondences
 from lib.recordings import Scene
 
-_DARK, _FLAT = 6.0, 1.5  # grey levels: an image that is darker on average, or varies less, shows nothing
-_REPEATED_PX = 0.3  # a detector finds the same landmarks in the same image within this
-_MOVED_PX = 5.0  # landmarks that all moved farther than this moved
-_RESTARTED = 10  # frames in order that are older than one before: then the clock is another
-_FAR_MM = 300.0  # from where the robot was: beyond any tool's reach
+_DARK, _FLAT = 6.0, 1.5  # grey levels: an image with a lower mean, or a lower standard deviation, shows nothing
+_REPEATED_PX = 0.3  # detections in an image and its copy differ by less
+_MOVED_PX = 5.0  # the tool has moved if all its landmarks moved farther
+_RESTARTED = 10  # after more frames in order that are older than an earlier one, the clock has been restarted
+_FAR_MM = 300.0  # a larger jump of the robot's report is beyond any tool's reach
 
 
 class FrameChecks:
@@ -23,7 +23,7 @@ class FrameChecks:
         self._doubted, self._time, self._older = 0, -np.inf, []
 
     def images(self, left: object, right: object, time_s: float) -> str:
-        """Why this pair of images shows nothing new, "" where it does; call `landmarks` next."""
+        """The reason why this pair of images is not usable, or ""; call `landmarks` next."""
         pair = [np.asarray(left), np.asarray(right)]
         if pair[0].ndim != 3 or pair[0].shape[2] != 3 or pair[0].dtype != np.uint8 or pair[1].shape != pair[0].shape:
             shapes = " and ".join(str(image.shape) for image in pair)
@@ -48,7 +48,7 @@ class FrameChecks:
         return ""
 
     def landmarks(self, u: np.ndarray) -> str:
-        """Why landmarks u (2, 3, 2) px, NaN = missing, are those of the frame before, "" where they are not."""
+        """The reason why the images count as frozen, or "": landmarks u (2, 3, 2) px, NaN = missing, repeat those before."""
         before, self._u = self._u, u
         step = np.fmax.reduce(np.abs(u - before), axis=(1, 2))  # NaN where nothing can be compared
         nothing = ~np.isfinite([u, before]).any(axis=(0, 2, 3))
@@ -57,7 +57,7 @@ class FrameChecks:
         return f"frozen video: the {names} image repeats the one before" if names else ""
 
     def robot(self, data: Correspondences) -> str:
-        """Why the robot's report is not to be used, "" where it is."""
+        """The reason why the robot's report is not usable, or ""."""
         x, y, before = data.x_mm, np.hstack([data.u_left, data.u_right]), self._believed
         if not np.isfinite(x).all(axis=1).any():
             return "the robot reports nothing"
@@ -70,6 +70,6 @@ class FrameChecks:
             step = np.linalg.norm(y - before[1], axis=1) / np.sqrt(2.0)
             if same and np.fmin.reduce(step) > _MOVED_PX:
                 return "the robot's report is frozen while the tool moves"
-        if not same:  # else compared with where the tool was seen when the report last changed
+        if not same:  # a report that stands still is compared with the landmarks at its last change
             self._believed, self._doubted = (x.copy(), y), 0
         return ""

@@ -18,7 +18,7 @@ from lib.recordings import Recording
 
 
 class Tally:
-    """What a run came to, in constant memory: the latencies, from arrival to distance, are of the newest 100,000 frames."""
+    """Statistics of a run, in constant memory; the latencies, from arrival to distance, are of the newest 100,000 frames."""
 
     def __init__(self) -> None:
         self.start, self.cpu_start = time.monotonic(), time.process_time()
@@ -39,15 +39,15 @@ class Tally:
         states = ", ".join(f"{state} {n}" for state, n in self.states.most_common())
         failures = ", ".join(f"{name} {n}" for name, n in self.failures.most_common()) or "none"
         return (
-            f"{n} frames in {spent:.1f} s, {n / spent:.1f} a second; processor {cpu / max(n, 1):.3f} s a frame\n"
-            f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
+            f"{n} frames in {spent:.1f} s, {n / spent:.1f} per second; processor time {cpu / max(n, 1):.3f} s per frame\n"
+            f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} per second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
             f"states: {states}\nfailures: {failures}{_memory()}"
         )
 
 
 def _memory() -> str:
-    """A line about the most memory that this process has held; none on Windows, which does not tell."""
+    """A line with the peak memory of this process, or "" on Windows, which does not report it."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -57,16 +57,16 @@ def _memory() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """`python3 -m lib online`: run the online system over a recording, as fast as it goes or as if it were live."""
+    """`python3 -m lib online`: run the online system over a recording, as fast as possible or in real time."""
     parser = argparse.ArgumentParser(prog="python3 -m lib online", description=main.__doc__.split(": ", 1)[1])
     add = parser.add_argument
     add("recording", type=Path)
-    add("--live", action="store_true", help="frames come at their own times and may be lost; surfaces in a process beside")
-    add("--record", type=Path, metavar="FOLDER", help="write inputs and outputs; FOLDER/input can be given again")
-    add("--video", type=Path, metavar="FILE.mp4", help="write what the system sees and says as a video")
+    add("--live", action="store_true", help="frames come in real time and may be lost; surfaces are made in another process")
+    add("--record", type=Path, metavar="FOLDER", help="write inputs and outputs; FOLDER/input is a recording")
+    add("--video", type=Path, metavar="FILE.mp4", help="write a video of images, states and distances")
     add("--weights", type=Path, help="detector (default: the one that ships)")
     add("--frames", type=int, help="only the first N frames")
-    add("--surface-every", type=int, default=1, help="ask for a surface in every N-th frame")
+    add("--surface-every", type=int, default=1, help="reconstruct the surface in every N-th frame")
     a = parser.parse_args(argv)
     if min(a.surface_every, 1 if a.frames is None else a.frames) < 1:
         parser.error("--frames and --surface-every: must be at least 1.")
@@ -88,9 +88,9 @@ def main(argv: list[str] | None = None) -> int:
             result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
             tally.add(result, time.monotonic() - start)
             near = "; the cameras have a finite distance" if np.isfinite(result.working_distance_mm) else ""
-            if (told := f"{result.state} {result.cause}".rstrip() + near) != state:
-                state = told
-                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {told}")
+            if (now := f"{result.state} {result.cause}".rstrip() + near) != state:
+                state = now
+                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {now}")
             for name, why in result.failures.items():
                 print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
             if recorder:
@@ -99,7 +99,7 @@ def main(argv: list[str] | None = None) -> int:
                 show(page.draw(arrival.left, arrival.right, result))
     print(tally)
     if a.live:
-        print(f"frames lost before they were seen: {feed.lost}")
+        print(f"frames lost before they were processed: {feed.lost}")
     if recorder:
-        print(recorder.failure or f"recorded in {recorder.folder}; images left out of the record: {recorder.left_out}")
+        print(recorder.failure or f"recorded in {recorder.folder}; frames left out of the record: {recorder.left_out}")
     return 0

@@ -1,8 +1,8 @@
-"""From tip to retina: where each landmark is, how far from the surface, and how sure that is.
+"""From tip to retina: the position of each landmark, its distance from the surface, and the standard deviation of that.
 
-A landmark lies where the robot reports it, plus the robot's constant error that the calibration found, plus a correction
-that changes slowly: a tool that slips, a robot that bends.  A Kalman filter follows the correction, which each frame's
-triangulated landmarks measure.  So the distances have the robot's small noise and not the detector's.
+The position is the robot's report, plus the robot's constant error as calibrated, plus a correction that changes slowly, as
+when a tool slips or a robot bends.  A Kalman filter estimates the correction from the triangulated landmarks of each frame.
+So the distances have the robot's small noise and not the detector's.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from lib.online.result import FrameResult, Settings
 from lib.online.tracker import RigTracker
 from lib.surface import Reconstruction
 
-_WALK_MM = 0.005  # per square root of a second: how fast the correction may change
-_SMOOTH_S = 0.2  # over which the robot's velocity is averaged
-_SILENT_S = 0.5  # after so long without a report the velocity is not known
+_WALK_MM = 0.005  # random walk of the correction, per square root of a second
+_SMOOTH_S = 0.2  # time constant over which the robot's velocity is averaged
+_SILENT_S = 0.5  # after a longer gap without a report the velocity is unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Surface:
     index: int
     time_s: float
     seconds: dict[str, float]
-    failures: dict[str, str]  # stage -> why it has none
+    failures: dict[str, str]  # stage -> why there is no reconstruction
 
 
 class TipDistance:
@@ -41,14 +41,14 @@ class TipDistance:
         self._x, self._velocity, self._moved_s = np.full((3, 3), np.nan), np.full((3, 3), np.nan), np.full(3, np.nan)
 
     def reset(self) -> None:
-        """Forget the correction: the cameras that measured it are not where they were."""
+        """Forget the correction, since the cameras that measured it have moved."""
         self._correction, self._time, self._seen_s = np.zeros((len(LANDMARKS), 3)), float("nan"), float("inf")
         self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
 
     def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, at: Surface | None) -> None:
-        """Set the result's distances to the newest surface, their standard deviations, approach and alarm.
+        """Set the result's distances to the newest surface `at`, their standard deviations, approach and alarm.
 
-        The robot reports `x_mm` (3, 3), NaN where it is silent or not to be believed.
+        `x_mm` (3, 3) is the robot's report, NaN where it is silent or not believed.
         """
         seen, covariance = self.triangulate(result, tracker)
         robot = np.isfinite(x_mm).all(axis=1)
@@ -65,18 +65,18 @@ class TipDistance:
         own = self._covariance + error_covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
         covariance = np.where(robot[:, None, None], own, covariance)
         age_s = float("nan") if at is None else result.time_s - at.time_s
-        if not 0.0 <= age_s <= self.settings.stale_s:  # below 0 where the clock started again
+        if not 0.0 <= age_s <= self.settings.stale_s:  # negative if the clock was restarted
             return
         surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
         found, view = surface.distance(x, camera), camera.viewing_direction
         result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
-        # What moves unseen is the eye since the surface, and cameras since the landmarks were seen.
+        # Unseen motions: of the eye since the surface was made, and of the cameras since the landmarks were last seen.
         drift = self.settings.eye_mm_s * max(age_s, result.time_s - self._seen_s)
         if not len(rows := np.flatnonzero(np.isfinite(found.along_view_mm))):
             return
         u = camera.project(x[rows])
         slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
-        # How the distance along the view changes with the tip: the surface point behind it moves too.
+        # Derivative of the distance along the view by the tip's position; the surface point behind the tip moves, too.
         towards = slope @ camera.linear - view
         behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
         normal = surface.normal(found.nearest_u[rows])
@@ -84,7 +84,7 @@ class TipDistance:
             (result.distance_sd_mm, towards, np.broadcast_to(view, towards.shape), behind, surface(u)),
             (result.normal_sd_mm, normal, normal, nearest, found.nearest_mm[rows]),
         ):
-            # The calibration puts the surface beside the robot's points, and not the tip.
+            # An error of the calibration displaces the surface relative to the robot, but not the tip.
             apart = covariance[rows] + tracker.point_covariance(at_mm)
             variance = np.einsum("ni,nij,nj->n", direction, apart, direction)
             sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
@@ -94,7 +94,7 @@ class TipDistance:
 
     @staticmethod
     def triangulate(result: FrameResult, tracker: RigTracker) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks as the cameras see them (3, 3) mm, also into the result; their covariance from the detector (3, 3, 3)."""
+        """Triangulate the landmarks (3, 3) mm, also into the result; returns them and their covariance by the detector."""
         data = result.landmarks
         found = tracker.rig.triangulate(data.u_left, data.u_right, tracker.detection_covariance(data))
         result.x_tool_mm = found.x_mm
@@ -104,7 +104,7 @@ class TipDistance:
         if np.isfinite(self._time) and time_s > self._time:
             self._covariance = np.minimum(self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3), 1.0)
         step_s = time_s - self._moved_s
-        known = (step_s > 0) & ((step_s <= _SILENT_S) | (self._moved_s == self._time))  # in the frame before
+        known = (step_s > 0) & ((step_s <= _SILENT_S) | (self._moved_s == self._time))  # or in the frame before
         self._time = time_s
         self._velocity[~known] = np.nan
         for k in np.flatnonzero(np.isfinite(x_mm).all(axis=1)):

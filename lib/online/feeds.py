@@ -1,6 +1,6 @@
-"""Where stereo frames come from: a recording as fast as it goes, a recording as if it were live, or anything iterable.
+"""Sources of stereo frames: a recording as fast as possible, a recording in real time, or any iterable.
 
-And where they go: `Recorder` keeps a run in a folder.
+`Recorder` writes a run into a folder.
 """
 
 import csv
@@ -22,26 +22,26 @@ from lib.correspondences import LANDMARKS, of_recording
 from lib.online.result import STAGES, FrameResult
 from lib.recordings import Recording, encoded
 
-_WAITING = 4  # frames at most, for a pause of the machine; when another comes, the oldest is lost
+_WAITING = 4  # most frames in the queue, enough for a pause of the machine; when another comes, the oldest is lost
 _QUANTITIES = ("distance_mm", "distance_sd_mm", "normal_mm", "normal_sd_mm", "approach_mm_s", "too_close")
 
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """A stereo frame as `OnlinePipeline.step` takes it, and its number in the recording that it is from."""
+    """A stereo frame with the arguments of `OnlinePipeline.step`, and its number in its recording."""
 
     left: np.ndarray
     right: np.ndarray
     kinematics: ArrayLike | Callable | None
     time_s: float
-    arrived_s: float = float("nan")  # by `time.monotonic`, where frames do not wait for whoever takes them
-    source: int = -1
+    arrived_s: float = float("nan")  # time of arrival by `time.monotonic`, if frames come in real time
+    source: int = -1  # -1: of no recording
 
 
 def recorded(recording: Recording, n_frames: int | None = None) -> Iterator[Arrival]:
     """The frames of a recording, each when it is asked for.
 
-    Anything else that yields `Arrival` will do as well.  A live camera, for example:
+    Any other iterator of `Arrival` can take its place.  A live camera, for example:
 
         cameras = cv2.VideoCapture(0), cv2.VideoCapture(1)
         while True:
@@ -54,7 +54,7 @@ def recorded(recording: Recording, n_frames: int | None = None) -> Iterator[Arri
 
 
 class Live:
-    """Any arrivals, each at its own time: who is busy then finds it in the queue, or among the `lost`, which are counted."""
+    """Yields arrivals in real time, each at its own time, through a short queue; `lost` counts those that were missed."""
 
     def __init__(self, arrivals: Iterator[Arrival]) -> None:
         self.lost, self._arrivals = 0, arrivals
@@ -79,26 +79,26 @@ class Live:
                 if ended.wait(max(due - time.monotonic(), 0.0)):
                     return
                 while ready.qsize() >= _WAITING:
-                    with suppress(queue.Empty):  # taken meanwhile
+                    with suppress(queue.Empty):  # the consumer took it meanwhile
                         ready.get_nowait()
                         self.lost += 1
                 ready.put(replace(arrival, arrived_s=max(due, time.monotonic())))  # on time, or as late as decoding was
-        except Exception as error:  # told to whoever takes the frames
+        except Exception as error:  # raised again in the consumer
             last = error
         ready.put(last)
 
 
 class Recorder:
-    """Writes what goes in and what comes out: `input/` is a recording that can be given again, `frames.csv` the outputs.
+    """Writes the input and the output of a run: `input/` is a recording that can be run again, `frames.csv` has the results.
 
-    Each frame is written as it comes, in a thread of its own; a full disk ends the recording and not the run.
+    Frames are written as they come, in a thread of their own.  A full disk ends the recording, but not the run.
 
     Args:
         folder: New, or empty.
-        recording: Where the frames come from: its kinematics and clocks make `input/` a recording like it.
-        patient: Wait for the disk; else frames are left out where it is too slow, and `left_out` counts them.
+        recording: The source of the frames; its kinematics and clocks are copied to `input/`.
+        patient: Wait for a slow disk.  Otherwise frames for which it is too slow are left out, and `left_out` counts them.
 
-    `failure` says why the recording ended early, "" where it did not.  A `FileExistsError` if the folder holds something.
+    `failure` is the reason why the recording ended early, or "".  A `FileExistsError` if the folder is not empty.
     """
 
     def __init__(self, folder: str | Path, recording: Recording, *, patient: bool = True) -> None:
@@ -115,7 +115,7 @@ class Recorder:
         self._thread.start()
 
     def add(self, arrival: Arrival, result: FrameResult) -> None:
-        """A frame and what was said about it."""
+        """Record a frame and its result."""
         if not self.failure and not self._patient and self._queue.full():
             self.left_out += 1
         elif not self.failure:
@@ -132,20 +132,20 @@ class Recorder:
                 how = {"encoding": "utf-8", "newline": "", "buffering": 1}  # a line is in the file as soon as it is written
                 paths = (self.folder / name for name in ("frames.csv", "seconds.csv", "input/frames.csv"))
                 files = [stack.enter_context(path.open("w", **how)) for path in paths]
-                told, spent, times = (csv.writer(file, lineterminator="\n") for file in files)
-                told.writerow(row(FrameResult(0)))
+                results, spent, times = (csv.writer(file, lineterminator="\n") for file in files)
+                results.writerow(row(FrameResult(0)))
                 spent.writerow(["frame", *STAGES])
                 times.writerow(["frame", "time_s"])
                 while (item := self._queue.get()) is not None:
                     arrival, cells, seconds = item
                     self._write_images(arrival)
-                    told.writerow(cells.values())
+                    results.writerow(cells.values())
                     spent.writerow([cells["frame"], *seconds])
                     times.writerow([self._count, float(arrival.time_s)])
                     self._count += 1
-        except Exception as error:  # told by `failure`; whoever adds frames must not wait for a thread that has ended
+        except Exception as error:  # stated in `failure`; `add` must not wait for a thread that has ended
             self.failure = f"{self.folder}: the recording ended after {self._count} frames ({error})."
-            while self._queue.get() is not None:  # nobody waits for a place
+            while self._queue.get() is not None:  # empty the queue, so that `add` never blocks
                 pass
 
     def _write_images(self, arrival: Arrival) -> None:
@@ -159,9 +159,9 @@ class Recorder:
 
 
 def row(result: FrameResult) -> dict[str, str]:
-    """Column of frames.csv -> cell of a frame; numbers as Python writes them, so that equal text is an equal number.
+    """Column of frames.csv -> cell of a frame.  Numbers are written by `repr`, so that equal numbers give equal text.
 
-    Times of stages stand in seconds.csv, so that a replay gives the same frames.csv, byte for byte.
+    Times of stages are in seconds.csv, so that a replay gives the same frames.csv, byte for byte.
     """
     numbers = {f"{name}_{what}": getattr(result, what)[k] for what in _QUANTITIES for k, name in enumerate(LANDMARKS)}
     for side, u in (("left", result.landmarks.u_left), ("right", result.landmarks.u_right)):

@@ -1,7 +1,7 @@
-"""The online system (paper Sec. V): every stage, frame by frame, with the seconds of each and what failed.
+"""The online system (paper Sec. V): every stage, frame by frame, with the duration of each stage and its failures.
 
-It starts without a calibration, and calibrates as soon as there are landmarks and kinematics enough.  From then on each
-frame is reconstructed, and its landmarks show whether the cameras moved, or what else is wrong.
+It starts without a calibration, and calibrates as soon as there are enough landmarks and kinematics.  From then on each
+frame is reconstructed, and its landmarks show whether the cameras moved or something else is wrong.
 """
 
 from collections.abc import Callable
@@ -25,29 +25,29 @@ from lib.online.tracker import RigTracker, Seen
 from lib.recordings import GrowingGround
 from lib.surface import Reconstruction, reconstruct
 
-_JUMP_MM = 0.15  # by which a surface differs from one before only where the eye or the cameras moved
-_DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
+_JUMP_MM = 0.15  # surfaces that differ by more show that the eye or the cameras moved between them
+_DEPTH_MARGIN_MM = 0.5  # largest motion of the eye along the view from one surface to the next
 
 
 class OnlinePipeline:
-    """Landmarks, calibration, watch and registration, surface and distance, one `step` a frame.
+    """Landmarks, calibration, drift monitor, registration, surface and distance, in one `step` per frame.
 
         pipeline = OnlinePipeline(Detector.load())
         for i, frame in enumerate(recording.frames):
             result = pipeline.step(frame.left, frame.right, partial(of_recording, recording, frames=[i]))
 
-    A frame never ends the run: a stage that fails leaves its reason in the result, and the others go on as far as they
-    can.  `lib.online.STATES` says what each state means.
+    A frame never ends the run: if a stage fails, the reason is in the result, and the other stages go on as far as they
+    can.  `lib.online.STATES` has the meaning of each state.
 
     Args:
-        detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
-            and `.confidence`.  If it has methods `track` and `near`, they follow the tool and look where the robot says.  The
-            memory of the images holds the next frame later: a detector that keeps them needs a copy.
+        detector: `lib.landmarks.Detector`, or any function of images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
+            and `.confidence`.  Methods `track` and `near`, if any, follow the tool and search near the robot's report.
+            The memory of the images is used again for the next frame: a detector that keeps them must copy them.
         rig: A rig or a calibration to start from, kept until the cameras move; None calibrates from the first frames.
-        noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
-        beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
-            same output for the same input.  Use it in a ``with`` block, which ends the process.
-        calibrate, reconstruct: Replace `lib.calibration.calibrate_as_shown` and, in turn, `lib.surface.reconstruct`.
+        noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` without a calibration.
+        beside: Reconstruct surfaces in a separate process, the newest frame first; otherwise within `step`, which gives
+            the same output for the same input.  Use the pipeline in a ``with`` block, which ends the process.
+        calibrate, reconstruct: Replace `lib.calibration.calibrate_as_shown` and (unless `beside`) `lib.surface.reconstruct`.
     """
 
     def __init__(
@@ -60,77 +60,77 @@ class OnlinePipeline:
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
         self._surface: Surface | None = None
-        self._surface_seen: Surface | None = None  # the newest while the landmarks were in view
+        self._surface_seen: Surface | None = None  # the newest surface when the landmarks were last in view
         self._pair: np.ndarray | None = None
         self._ground = GrowingGround()
         self._smoothness: float | None = None
-        self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
+        self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since a full search; first frame
         self._rests_on = dict.fromkeys(("landmarks", "robot"), float("nan"))
-        self._beside, self._reconstruct = Beside() if beside else None, reconstruct
+        self._worker, self._reconstruct = Beside() if beside else None, reconstruct
 
     def __enter__(self) -> Self:
-        if self._beside:
-            self._beside.wait_ready()
+        if self._worker:
+            self._worker.wait_ready()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._beside:
-            self._beside.close()
+        if self._worker:
+            self._worker.close()
 
     @property
     def rig(self) -> StereoRig | None:
-        """In force now, None before the first calibration."""
+        """The rig in use, None before the first calibration."""
         return self._tracker.rig
 
     @property
     def calibration(self) -> Calibration | None:
-        """That `rig` comes from, None for a rig that was given."""
+        """The calibration that `rig` comes from, None for a rig that was given."""
         return self._tracker.calibration
 
     def step(
         self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None = None, *,
         time_s: float | None = None,
     ) -> FrameResult:  # fmt: skip
-        """Take in one stereo frame.
+        """Process one stereo frame.
 
         Args:
             left, right: (h, w, 3) uint8 RGB.
             kinematics: (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the
-                robot said nothing.  Or a function that pairs the detections with the robot's positions at the instants
-                at which their rows were read, given as to `lib.correspondences.pair_with_robot`, and returns the
-                frame's Correspondences: ``partial(of_recording, recording, frames=[index])``.  Before anything is detected
-                it is called with NaN, to tell where the robot has the tool.
-            time_s: Of the frame, video clock; None = uniform at `Settings.fps`.
+                robot is silent.  Or a function that takes detections as `lib.correspondences.pair_with_robot` does, pairs
+                them with the robot's positions at the instants at which their image rows were read, and returns the
+                frame's Correspondences: ``partial(of_recording, recording, frames=[index])``.  Before detection it is called
+                with NaN, to find out where the robot reports the tool.
+            time_s: Time of the frame, video clock; None = uniform at `Settings.fps`.
         """
         self._index += 1
         time_s = self._index / self.settings.fps if time_s is None else float(time_s)
         result, tracker = FrameResult(self._index, time_s), self._tracker
-        blind, told, x_mm = "the images cannot be read", "", np.full((3, 3), np.nan)
+        bad_images, bad_report, x_mm = "the images cannot be read", "", np.full((3, 3), np.nan)
         with result.stage("detect"):
-            blind = self._checks.images(left, right, time_s)
-            frame = None if blind else self._detect(left, right, kinematics)
-            blind = blind or self._checks.landmarks(np.stack([frame.data.u_left, frame.data.u_right]))
+            bad_images = self._checks.images(left, right, time_s)
+            frame = None if bad_images else self._detect(left, right, kinematics)
+            bad_images = bad_images or self._checks.landmarks(np.stack([frame.data.u_left, frame.data.u_right]))
             if frame is not None:
                 result.landmarks = frame.data
-                told = self._checks.robot(frame.data)
-                x_mm = x_mm if told else frame.data.x_mm
+                bad_report = self._checks.robot(frame.data)
+                x_mm = x_mm if bad_report else frame.data.x_mm
                 self._ground.take(self._pair, x_mm)
-        if blind and "detect" not in result.failures:
-            result.failures["images"] = blind
-        if told and kinematics is not None:
-            result.failures["robot"] = told
-        data, seen = result.landmarks, not blind and bool(result.landmarks.seen.all(axis=1).any())
-        for name, fresh in (("landmarks", seen), ("robot", not blind and np.isfinite(x_mm).any())):
+        if bad_images and "detect" not in result.failures:
+            result.failures["images"] = bad_images
+        if bad_report and kinematics is not None:
+            result.failures["robot"] = bad_report
+        data, seen = result.landmarks, not bad_images and bool(result.landmarks.seen.all(axis=1).any())
+        for name, fresh in (("landmarks", seen), ("robot", not bad_images and np.isfinite(x_mm).any())):
             self._rests_on[name] = time_s if fresh else self._rests_on[name]
         before, calibration = tracker.rig, tracker.calibration
-        if seen and not told and data.is_complete.any():
+        if seen and not bad_report and data.is_complete.any():
             tracker.take(result, frame, self._checks.scene)
-        self._name_state(result, blind, told, seen)
+        self._name_state(result, bad_images, bad_report, seen)
         result.rig = tracker.rig
         if tracker.calibration is not calibration or result.motion is not None:
             self._rig_since = self._index
         if result.motion is not None:
-            self._ground = GrowingGround()  # the cameras see other places now
+            self._ground = GrowingGround()  # the cameras now see another part of the scene
         if tracker.rig is not before and (result.motion is not None or tracker.rig is None):
             self._tips.reset()
         if tracker.rig is not None and seen:
@@ -144,50 +144,50 @@ class OnlinePipeline:
             recent, result.cause = False, "no landmarks, and eye or cameras moved since they were seen"
         if tracker.rig is not None and (result.state in ("tracking", "robot") or (result.state == "unseen" and recent)):
             with result.stage("distance"):
-                # That a report is late, or the tool slipped, is what the tracker says, and not the frame's own checks.
-                told_mm = np.full((3, 3), np.nan) if result.state == "robot" else x_mm
-                self._tips.measure(result, tracker, told_mm, self._surface)
+                # State "robot" means that the report is late or the tool slipped, even if the frame passed its own checks.
+                trusted_mm = np.full((3, 3), np.nan) if result.state == "robot" else x_mm
+                self._tips.measure(result, tracker, trusted_mm, self._surface)
         surface_s = self._surface.time_s if self._surface else float("nan")
         result.rests_on = self._rests_on | {"rig": tracker.rests_on_s, "surface": surface_s}
         return result
 
-    def _name_state(self, result: FrameResult, blind: str, told: str, seen: bool) -> None:
-        """From the worst: what the images show, what the robot says, how the two agree."""
-        if result.state == "moved":  # this frame alone
+    def _name_state(self, result: FrameResult, bad_images: str, bad_report: str, seen: bool) -> None:
+        """Set state and cause of a result, from the images, the robot's report, and the agreement of the two."""
+        if result.state == "moved":  # only this frame stands out
             return
         state, cause = self._tracker.state, self._tracker.cause
         if state == "tracking" and self._tracker.is_unsettled(result.index):
             state, cause = "moved", "the cameras seem to move again and again: something else has changed"
         measures = state in ("tracking", "robot")
-        if blind:
-            state, cause = "blind", blind
-        elif measures and not seen and (told or state == "robot"):
+        if bad_images:
+            state, cause = "blind", bad_images
+        elif measures and not seen and (bad_report or state == "robot"):
             state, cause = "blind", "neither landmarks nor report"
         elif measures and not seen:
             state, cause = "unseen", "no landmarks"
-        elif measures and told:
-            state, cause = "robot", told
+        elif measures and bad_report:
+            state, cause = "robot", bad_report
         result.state, result.cause = state, cause
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:
-            self._pair = np.empty((2, *left.shape), np.uint8)  # kept: fresh memory costs more than the copy
+            self._pair = np.empty((2, *left.shape), np.uint8)  # reused: fresh memory costs more than the copy
             self._ground = GrowingGround()
         images, previous = np.stack([left, right], out=self._pair), self._seen
-        self._seen = None  # whatever fails now, the next frame is searched as a whole
+        self._seen = None  # if anything fails now, the whole next frame is searched
         paired, known = self._pairing(kinematics), with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
         guides = hasattr(self._detector, "near") and getattr(self._detector, "tool_network", True) is not None
-        told = self._told_px(paired) if guides else None
-        previous = self._guided(images, previous, told, known) if follow else previous
+        robot_px = self._robot_px(paired) if guides else None
+        previous = self._guided(images, previous, robot_px, known) if follow else previous
         found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
-        self._seen = found = self._guided(images, found, told, known)
+        self._seen = found = self._guided(images, found, robot_px, known)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         return Seen(paired(self.rig, u, **stated), partial(paired, u=u, **stated))
 
     def _pairing(self, kinematics: ArrayLike | Callable | None) -> Callable[..., Correspondences]:
-        """A function that pairs this frame's landmarks u (2, 3, 2) px, by a rig, with `kinematics` as `step` takes them."""
+        """A function (rig, u (2, 3, 2) px) that pairs this frame's landmarks with `kinematics`, an argument of `step`."""
         index, landmarks = np.full(len(LANDMARKS), self._index), list(range(len(LANDMARKS)))
         if not callable(kinematics):
             x_mm = np.full((3, 3), np.nan) if kinematics is None else np.array(kinematics, dtype=np.float64)
@@ -204,29 +204,29 @@ class OnlinePipeline:
 
         return paired
 
-    def _guided(self, images: np.ndarray, found: Landmarks, told: np.ndarray | None, known: dict) -> Landmarks:
-        """`found`, and what is seen where the robot has the landmarks, `told`, if they are in doubt or elsewhere."""
-        lost = [] if told is None else np.flatnonzero(found.doubtful | found.away(told).any(axis=1))
+    def _guided(self, images: np.ndarray, found: Landmarks, robot_px: np.ndarray | None, known: dict) -> Landmarks:
+        """`found`; images in which it is in doubt or far from `robot_px` are searched again near `robot_px`."""
+        lost = [] if robot_px is None else np.flatnonzero(found.doubtful | found.away(robot_px).any(axis=1))
         if len(lost):
             ground = known.get("ground")
-            near = self._detector.near(images[lost], told[lost], ground=ground and (lambda: ground()[lost]))
+            near = self._detector.near(images[lost], robot_px[lost], ground=ground and (lambda: ground()[lost]))
             found = Landmarks.join([found])  # a copy
             found.put(lost[~near.doubtful], near[~near.doubtful])
         return found
 
-    def _told_px(self, paired: Callable[..., Correspondences]) -> np.ndarray | None:
-        """(2, 3, 2) px where the rig in force has the landmarks that the robot reports; None if one is not known."""
+    def _robot_px(self, paired: Callable[..., Correspondences]) -> np.ndarray | None:
+        """(2, 3, 2) px: the robot's landmarks, projected by the rig in use; None if there is no rig or one is unknown."""
         if self.rig is None:
             return None
         n = len(LANDMARKS)
         nothing = {"covariance_px2": np.full((n, 2, 2, 2), np.nan), "confidence": np.zeros((n, 2))}
-        with suppress(ValueError, TypeError):  # no positions, of which the frame's failure will tell, or behind a camera
+        with suppress(ValueError, TypeError):  # no positions, which the frame's failure will state, or behind a camera
             x_mm = self._tracker.corrected(paired(self.rig, np.full((2, n, 2), np.nan), **nothing)).x_mm
             return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
         return None
 
     def _surface_jumped(self) -> bool:
-        """Whether the newest surface lies elsewhere than the newest one while the landmarks were in view."""
+        """True if the newest surface lies elsewhere than the newest one when the landmarks were last in view."""
         now, before = self._surface, self._surface_seen
         if now is None or before is None or now is before:
             return False
@@ -237,7 +237,7 @@ class OnlinePipeline:
         return not len(apart) or bool(np.median(apart) > _JUMP_MM)
 
     def _where_to_search(self) -> dict[str, Any]:
-        """Where to match: near the last surface, but everywhere in every tenth frame, for a new rig, or after few points."""
+        """Options that limit matching to the last surface; {} in every tenth frame, for a new rig, or after few points."""
         last, self._asked = self._surface, self._asked + 1
         known = last is not None and last.index >= self._rig_since
         if not known or self._asked % 10 == 0 or len(last.reconstruction.u) < 0.6 * self._most_points:
@@ -246,32 +246,32 @@ class OnlinePipeline:
         return {"depth_range_mm": last.reconstruction.depth_range_mm(_DEPTH_MARGIN_MM), "max_epipolar_px": np.inf}
 
     def _follow_surface(self, result: FrameResult, left: np.ndarray, right: np.ndarray) -> None:
-        """Ask for a surface of this frame, and take the newest that is there."""
+        """Request a surface of this frame, and take the newest that is ready."""
         tracker = self._tracker
-        if self._beside and (tracker.doubted_since is not None or tracker.rig is None):
-            self._beside.forget()
+        if self._worker and (tracker.doubted_since is not None or tracker.rig is None):
+            self._worker.forget()
         if self._surface is not None and tracker.doubts(self._surface.index):
-            self._surface = None  # its cameras stood elsewhere
+            self._surface = None  # its cameras had moved
         done, due = [], self._index % self.settings.surface_every == 0 or result.motion is not None
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
             tool = result.landmarks.u_left, result.landmarks.u_right
             options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
             options |= {"u_landmarks": tool, "percentiles": (1, 99)} | self._where_to_search()
             job = SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options)
-            if self._beside:
-                self._beside.submit(job)
+            if self._worker:
+                self._worker.submit(job)
             else:
                 done = [make(job, self._reconstruct)]
-        if self._beside:
-            done, event = self._beside.collect()
-            result.dropped = self._beside.dropped
+        if self._worker:
+            done, event = self._worker.collect()
+            result.dropped = self._worker.dropped
             if event:
                 result.failures["worker"] = event
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
             result.failures |= surface.failures
             if surface.reconstruction is not None and not tracker.doubts(surface.index):
-                # Chosen by held-out error once: the eye is the same in the next frame.
+                # The smoothness is chosen once, by held-out error, since the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
                 self._most_points = max(self._most_points, len(surface.reconstruction.u))
         if self._surface is not None:

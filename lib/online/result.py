@@ -1,4 +1,4 @@
-"""What a user may change about the online system, and what it says about each frame."""
+"""The settings of the online system, and its result for each frame."""
 
 import time
 from collections import Counter
@@ -18,12 +18,12 @@ from lib.surface import Reconstruction
 #: The stages whose seconds and failures a `FrameResult` names, in their order.
 STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", "distance")
 
-#: What each state means, and what follows for the distances.
+#: The meaning of each state, and the source of the distances in it.
 STATES = {
     "calibrating": "there is no rig yet, or the optics changed; no distances",
     "tracking": "images, robot and rig agree; distances from all three",
-    "unseen": "the eye is in view and the landmarks are not; distances from the robot's report, with a growing sd, until the "
-    "surface is not where it was",
+    "unseen": "the eye is in view, but the landmarks are not; distances from the robot's report, with a growing sd, until a "
+    "new surface shows that eye or cameras moved",
     "blind": "an image is black, corrupt, or repeats the one before; no distances",
     "robot": "the robot's report is missing, frozen or late, or the tool slipped; distances from the images",
     "moved": "images and robot disagree and nothing lasting explains it, or a camera's images are late; no distances",
@@ -32,24 +32,24 @@ STATES = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What a user may change.
+    """The settings of the online system.
 
     Attributes:
-        calibration_frames: Frames with landmarks before the first calibration, and frames after which it is not repeated.
-            In between it is repeated whenever a quarter more frames are at hand; after that each frame improves it.
-        registration_frames: Frames of the tool after the cameras moved before the first registration (the paper's 3),
-            and frames after which it is not refined.
-        give_up_frames: Frames that no motion explains after which the rig is calibrated afresh.
+        calibration_frames: Number of frames with landmarks for the first calibration, and number after which it is not
+            repeated.  In between it is repeated when the number has grown by a quarter; afterwards each frame improves it.
+        registration_frames: Number of frames with the tool, after the cameras moved, for the first registration (3 in the
+            paper), and number after which it is not refined.
+        give_up_frames: Number of frames that no motion explains, after which the rig is calibrated again.
         surface_every: Reconstruct the surface in every n-th frame.
-        setting: "fast" or "quality", as `lib.surface.reconstruct` has it.
+        setting: "fast" or "quality", an argument of `lib.surface.reconstruct`.
         control: Control points of the surface (n_x, n_y).
-        fps: Frames a second, for frames that come without a time.
-        stale_s: Distances end where the surface, or the last sight of the landmarks, is older.
+        fps: Frames per second, for frames without a time stamp.
+        stale_s: Largest age of the surface, and of the last detection of landmarks, for which distances are given.
         eye_mm_s: Speed at which eye and cameras may move unseen, by which the distance's standard deviation grows.
-        slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
+        slip_mm: Standard deviation of the landmarks' offset from the robot's report, in addition to its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
-        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed with
-            this probability.  False alarms are as rare for tips farther away than alarm_mm and twice `FrameResult.margin_mm`.
+        alarm_mm, miss_rate: A tip is `too_close` if its distance may be below alarm_mm.  A tip that truly is below is missed
+            with probability miss_rate.  False alarms are as rare for tips farther than alarm_mm + 2 `FrameResult.margin_mm`.
     """
 
     calibration_frames: tuple[int, int] = (8, 60)
@@ -79,25 +79,25 @@ _unknown = partial(np.full, len(LANDMARKS), np.nan)
 
 @dataclass
 class FrameResult:
-    """What one frame told.  Arrays are NaN, objects None, where a stage did not run or failed.
+    """The result of one frame.  Arrays are NaN, objects None, if a stage did not run or failed.
 
     Attributes:
-        index, time_s: Number of the frame since the start; its time, video clock.
+        index, time_s: Number of the frame since the start; its time in s, video clock.
         state, cause: One of `STATES`, and why it is not "tracking", in a few words.
-        landmarks, x_tool_mm: Where the detector saw and the robot reports them; (3, 3) as the cameras triangulate them.
-        rig: In force after this frame.
+        landmarks, x_tool_mm: The detected landmarks with the robot's report; (3, 3) the triangulated landmarks.
+        rig: The rig in use after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
-            standard deviation: detector, robot, calibration, surface and the surface's age.
+            standard deviation from detector, robot, calibration, surface and the surface's age.
         normal_mm, normal_sd_mm: The same along the surface's normal.
-        approach_mm_s: (3,) speed at which the robot takes each landmark towards the surface, along the view; NaN where it has
-            been silent for half a second.
-        too_close, margin_mm: (3,) alarm of `Settings.alarm_mm`, and how far above it the alarm already sounds.
-        rests_on: Time in s of the newest frame behind each of "landmarks", "robot", "rig" and "surface"; NaN = none.
+        approach_mm_s: (3,) speed at which the robot moves each landmark towards the surface, along the view; NaN if the robot
+            has been silent for half a second.
+        too_close, margin_mm: (3,) the alarm, raised below `Settings.alarm_mm` + margin_mm, and this margin.
+        rests_on: Time in s of the newest frame used for each of "landmarks", "robot", "rig" and "surface"; NaN = none.
         drift: Statistic of the drift monitor, in units of its alarm threshold.
-        motion: The registration made in this frame, if one was.
-        dropped: Surfaces asked for and dropped so far, because a newer frame came first.
-        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed; also "images", "robot", "worker".
+        motion: The registration that was made in this frame, or None.
+        dropped: Number of surfaces so far that were requested and dropped, because a newer frame came first.
+        seconds, failures: Stage -> wall-clock seconds, and stage -> reason of a failure (also "images", "robot", "worker").
     """
 
     index: int
@@ -126,17 +126,17 @@ class FrameResult:
 
     @property
     def working_distance_mm(self) -> float:
-        """Of the cameras in force: finite where the detections show one, infinite of affine ones and without a rig."""
+        """The working distance of the cameras in use; infinite if they are affine or there is no rig."""
         near = 0.0 if self.rig is None else getattr(self.rig.left, "inverse_distance_per_mm", 0.0)
         return 1.0 / near if near else float("inf")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage, and note its failure in place of raising it."""
+        """Time a stage; an exception is noted in `failures` instead of raised."""
         start = time.perf_counter()
         try:
             yield
-        except Exception as error:  # whatever a stage dies of: the next frame comes in 40 ms
+        except Exception as error:  # any error at all: the next frame comes in 40 ms
             self.failures[name] = f"{type(error).__name__}: {error}"
         finally:
             self.seconds[name] += time.perf_counter() - start

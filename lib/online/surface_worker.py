@@ -1,4 +1,4 @@
-"""Surfaces of stereo frames, also in a process beside the frames, the newest first."""
+"""Surface reconstruction of stereo frames, also in a separate process, the newest frame first."""
 
 import contextlib
 import multiprocessing
@@ -14,12 +14,12 @@ from lib.cameras import StereoRig
 from lib.online.distance import Surface
 from lib.surface import Reconstruction, reconstruct
 
-_STAGE_OF = {"mask": "match", "refine": "match"}  # what else is its own stage
+_STAGE_OF = {"mask": "match", "refine": "match"}  # part of a reconstruction -> stage, where the names differ
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceJob:
-    """A stereo frame to reconstruct, and what `lib.surface.reconstruct` is told."""
+    """A stereo frame to reconstruct, and the arguments of `lib.surface.reconstruct`."""
 
     left: np.ndarray
     right: np.ndarray
@@ -30,12 +30,12 @@ class SurfaceJob:
 
 
 def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstruct) -> Surface:
-    """The surface of a job, or why there is none."""
+    """The surface of a job, or the reason why there is none."""
     seconds: dict[str, float] = {}
     try:
         found, failures = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), {}
         found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
-    except Exception as error:  # whatever it dies of: the next frame may have a surface
+    except Exception as error:  # any error at all: the next frame may have a surface
         part = next(reversed(seconds), "match")
         found, failures = None, {_STAGE_OF.get(part, part): f"{type(error).__name__}: {error}"}
     spent = Counter()
@@ -45,9 +45,9 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
 
 
 class Beside:
-    """Makes surfaces in a process of its own.  One job is in work, one waits; a newer one takes its place.
+    """Makes surfaces in a separate process.  One job is in work and one waits; a newer job replaces the waiting one.
 
-    A worker that dies is started again.  Images go through shared memory, results through a pipe.
+    If the process dies, it is started again.  Images go through shared memory, results through a pipe.
     """
 
     def __init__(self) -> None:
@@ -64,11 +64,11 @@ class Beside:
         self._in_work = False
 
     def wait_ready(self) -> None:
-        """Until the process has started: before that it takes time from the frames."""
+        """Wait until the process has started, since starting takes CPU time from the frames."""
         self._pipe.poll(60.0)
 
     def submit(self, job: SurfaceJob) -> None:
-        """Take in a job; the one that waited is dropped."""
+        """Add a job; the one that was waiting is dropped."""
         self.dropped += self._waiting is not None
         self._waiting = job
         self._send()
@@ -88,7 +88,7 @@ class Beside:
         self._waiting, self._in_work, self._stale = None, True, False
 
     def collect(self) -> tuple[list[Surface], str]:
-        """The surfaces made since the last call, and what happened to the worker ("" = nothing); never waits."""
+        """The surfaces made since the last call, and a message if the process died, or ""; never waits."""
         done, event = [], ""
         with contextlib.suppress(EOFError, OSError):  # a dead worker is found below
             while self._pipe.poll():
@@ -105,7 +105,7 @@ class Beside:
         return done, event
 
     def forget(self) -> None:
-        """Drop what waits and what is in work: its rig is not to be believed."""
+        """Drop the waiting job and the one in work, since their rig is no longer trusted."""
         self.dropped += self._waiting is not None
         self._waiting, self._stale = None, True
 
@@ -116,7 +116,7 @@ class Beside:
             self._memory = None
 
     def close(self) -> None:
-        """End the process, which has nothing to lose, and free its memory."""
+        """Kill the process, which holds nothing of value, and free the shared memory."""
         self._process.kill()
         self._process.join()
         self._pipe.close()
@@ -124,7 +124,7 @@ class Beside:
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
-    """In the worker: jobs until the other side is gone.  Landmarks come first, so it yields to them."""
+    """The loop of the process: jobs until the pipe is closed.  Its low priority leaves the CPU to the landmarks."""
     with contextlib.suppress(AttributeError, OSError):  # not every system has priorities
         os.nice(10)
     pipe.send(None)

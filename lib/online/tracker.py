@@ -1,4 +1,4 @@
-"""Which rig is in force?  Calibration from the first frames, watch over each frame, registration after a motion."""
+"""The rig in use: calibrated from the first frames, tested in each frame, and registered again after a motion."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -19,28 +19,28 @@ from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import Verdict, judge
 
 _CHI2_4_MEDIAN = 3.357
-_STANDS_OUT = 8.0  # score of a single frame that is not to be believed
-_FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
-#: A scene that moved less stands still.  It contradicts cameras by which landmarks move more than 1 px and 3 times as far.
+_STANDS_OUT = 8.0  # score above which a single frame is rejected
+_FAR_MM = 200.0  # no tool reaches farther from the robot's median position
+#: A scene that shifts by less stands still.  Then no motion of the cameras shifts landmarks by more than 1 px + 3 times that.
 _STILL_PX, _NOISE_PX, _TIMES = 3.0, 1.0, 3.0
-_PATIENT = 5  # times `Settings.give_up_frames` pass before a rig is given up in front of a scene that stands still
+_PATIENT = 5  # factor on `Settings.give_up_frames` while the scene stands still
 _PAST = 40  # frames kept to find a late report
-_AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
+_AGAIN = 30  # frames after a registration in which no microscope moves again; a new motion refutes the registration
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The landmarks of a frame, three rows, and how to pair them with the robot by another rig: it moves pixels in time."""
+    """The landmarks of a frame, three rows; and a function that pairs them with the robot, given a rig for the shutter."""
 
     data: Correspondences
     pair: Callable[[StereoRig | None], Correspondences]
 
 
 class RigTracker:
-    """The rig in force, and whether images and robot still agree with it.
+    """The rig in use, and whether images and robot still agree with it.
 
     `rig`, `calibration`, `state` and `cause` are as in `OnlinePipeline` and `FrameResult`, `rests_on_s` is the time of the
-    newest frame that went into the rig, and `doubted_since` the number of the first frame that disagreed.
+    newest frame used for the rig, and `doubted_since` the number of the first frame that disagreed with it, or None.
     """
 
     def __init__(
@@ -54,23 +54,23 @@ class RigTracker:
             self._use(rig)
 
     def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
-        """Without a rig: at first, and where the optics changed, not only the pose."""
+        """Drop the rig: at the start, and when the images show other optics or nothing explains them."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
-        self._given = False  # a rig that was given is in force, which no calibration replaces
-        self._frames, self._tried, self._fitted = list(frames), 0, 0  # that the rig is calibrated with; how many of them
-        self._online: OnlineCalibration | None = None  # take the frames after the last calibration
+        self._given = False  # True while a rig that the user gave is in use, which no calibration replaces
+        self._frames, self._tried, self._fitted = list(frames), 0, 0  # for the calibration; number in the last try, and fit
+        self._online: OnlineCalibration | None = None  # improved by each frame after the last calibration
         self._monitor: DriftMonitor | None = None
-        self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet taken in: the cameras may have moved meanwhile
-        self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of frames that stood out alone
+        self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet used for the rig: the cameras may just have moved
+        self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of single frames that were rejected
         self._past: deque[Correspondences] = deque(maxlen=_PAST)
-        self._open: list[Correspondences] = []  # the last frame that `_past` no longer holds whose jaws surely do not cross
-        self._since: list[Seen] = []  # frames that tell where the cameras are now
-        self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
-        self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
+        self._open: list[Correspondences] = []  # the newest frame with surely open jaws that has left `_past`
+        self._since: list[Seen] = []  # frames since the disagreement, which show where the cameras are now
+        self._before: StereoRig | None = None  # the rig before the disagreement, while its cause is sought
+        self._motion: MovedCameras | None = None  # the motion that led to this rig; next, to the one before
         self._motion_before: MovedCameras | None = None
         self._scene: Scene | None = None  # of the newest frame that agreed with the rig
-        self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
-        # Numbers of frames: the newest registration, the newest motion soon after one, from a motion to its registration.
+        self._attempts, self._explained, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
+        # Numbers of frames: newest registration, newest motion soon after one, all frames from a motion to its registration.
         self._registered, self._again, self._astray = -_AGAIN, -_AGAIN, range(0)
 
     def _use(self, found: StereoRig | Calibration) -> None:
@@ -85,20 +85,20 @@ class RigTracker:
             _, _, weight, r = calibration.system
             chi2 = np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)[both]
             scatter, n = np.median(chi2) / _CHI2_4_MEDIAN, len(chi2)
-            # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
+            # Corrected for the 16 fitted parameters, and one standard deviation up, since few rows leave it uncertain.
             self._scale2 = scatter / (1.0 - 16.0 / max(4 * n, 17)) * (1.0 + 1.0 / np.sqrt(n)) ** 2
 
     def doubts(self, index: int) -> bool:
-        """Whether the cameras had moved in frame number `index` and the rig of then had not."""
+        """True if the rig in use in frame `index` was wrong, because the cameras had moved and were not registered yet."""
         since = self.doubted_since
         return self.rig is None or index in self._astray or (since is not None and index >= since)
 
     def is_unsettled(self, index: int) -> bool:
-        """Whether the newest registration is doubted, because one not long before it did not last."""
+        """True if the newest registration is doubted, because the one before it held only for a short time."""
         return index - self._again < _AGAIN
 
     def take(self, result: FrameResult, frame: Seen, scene: Scene) -> None:
-        """A frame with landmarks that both images and the robot know, and its scene."""
+        """Process a frame with complete landmarks (both images and the robot's report), and its scene."""
         if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful and self._is_open(self._past[0]):
             self._open = [self._past[0]]
         self._past.append(frame.data)
@@ -106,20 +106,20 @@ class RigTracker:
         if self.rig is not None:
             with result.stage("register"):
                 accepted = self._watch(result, frame, scene)
-        if self._takes_in(accepted):
+        if self._collect(accepted):
             with result.stage("calibrate"):
                 self._improve(accepted)
         if self.state == "tracking" and accepted:
             self.rests_on_s, self._scene = result.time_s, scene
 
-    def _takes_in(self, accepted: list[Seen]) -> bool:
-        """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
+    def _collect(self, accepted: list[Seen]) -> bool:
+        """Collect frames; True if the rig should be calibrated now: as early as possible, and after growth by a quarter."""
         first, last = self.settings.calibration_frames
-        if self._given or self._motion is not None or self._online is not None:
+        if self._given or self._motion is not None or self._online is not None:  # no new calibration, at most online updates
             return self._online is not None and bool(accepted) and self._motion is None
         self._frames += accepted
         if self.rig is None:
-            self._tried -= max(0, len(self._frames) - 2 * last)  # those that are left out now
+            self._tried -= max(0, len(self._frames) - 2 * last)  # the oldest are dropped now
             self._frames = self._frames[-2 * last :]
         n = len(self._frames)
         if self.rig is None:
@@ -127,19 +127,19 @@ class RigTracker:
         return n > last or n >= 1.25 * self._fitted
 
     def _improve(self, accepted: list[Seen]) -> None:
-        """Calibrate with all frames so far; after the last calibration let each frame improve it."""
+        """Calibrate with all frames so far, or after the last calibration improve it with the new frames."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
             if self._online is None:
                 self._online = OnlineCalibration(self.calibration)
                 accepted = self._frames[self._fitted :]
-            if any([self._online.add(self.corrected(frame.data)).any() for frame in accepted]):  # each is added
+            if any([self._online.add(self.corrected(frame.data)).any() for frame in accepted]):  # a list, to add every frame
                 self.rig = self._online.solve()
                 self._monitor.follow(self.rig)
             return
         self._tried = len(self._frames)
         found, kept = self._agreed(self._frames)
         verdict = self._judged(found)
-        if verdict.is_red or (self.cause and verdict.reasons):  # after a fault nothing doubtful is believed
+        if verdict.is_red or (self.cause and verdict.reasons):  # after a fault even a doubtful calibration is refused
             raise ValueError("; ".join(reason.text for reason in verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
@@ -148,7 +148,7 @@ class RigTracker:
         return judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
 
     def _agreed(self, frames: Sequence[Seen]) -> tuple[Calibration, list[Seen]]:
-        """The calibration by most frames, and the frames that agree with it: a bad frame is outvoted, at any place."""
+        """A calibration with all frames, or with the newer or the older half, and the frames that agree with it."""
         first = self.settings.calibration_frames[0]
         base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
         near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
@@ -160,7 +160,7 @@ class RigTracker:
         for part in parts:
             try:
                 found = self._calibrate(Correspondences.join(frame.pair(self.rig) for frame in part))
-            except Exception as error:  # the reason that counts is that of all frames together
+            except Exception as error:  # if all fail, the first error is raised, that with all frames
                 refused = refused or error
                 continue
             used = found.inliers.reshape(len(part), -1).any(axis=1)
@@ -168,7 +168,7 @@ class RigTracker:
         raise refused or ValueError("the robot's positions lie too far apart.")
 
     def _watch(self, result: FrameResult, frame: Seen, scene: Scene) -> list[Seen]:
-        """Do images and robot still agree?  If not, why not?  Returns frames that may improve the rig."""
+        """Test whether images and robot still agree, and if not, find the cause.  Returns frames that may improve the rig."""
         if self.state != "tracking":
             self._since.append(frame)
             return self._resolve(result, scene)
@@ -178,7 +178,7 @@ class RigTracker:
         self._recent.append(frame)
         if alarm:
             self._since = [*self._since, frame] if self._before is not None else list(self._recent)[-monitor.since :]
-            self.state, self.cause, self._waiting = "moved", f"images and robot disagree ({monitor.axis})", 0
+            self.state, self.cause, self._attempts = "moved", f"images and robot disagree ({monitor.axis})", 0
             self.doubted_since = int(self._since[0].data.frame[0])
             if self._before is None:
                 self._before, self._motion_before = self.rig, self._motion
@@ -193,7 +193,7 @@ class RigTracker:
             off = f"{np.nanmedian(np.linalg.norm(gap, axis=1)):.2f} mm"
             result.failures["robot"] = f"images and robot disagree by {off} in this frame: rejected"
             return []
-        if self._before is not None:  # registered, and made better
+        if self._before is not None:  # registered, and still being refined
             self._since.append(frame)
             return self._resolve(result, scene)
         n = 0 if monitor.statistic < 0.25 else monitor.since
@@ -201,20 +201,20 @@ class RigTracker:
         return [frame for frame in passed if int(frame.data.frame[0]) not in self._doubtful]
 
     def _resolve(self, result: FrameResult, scene: Scene) -> list[Seen]:
-        """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree.
+        """Explain the frames since the disagreement by a motion or another cause, which must also explain the newest frames.
 
-        A scene that stands still contradicts a motion: then the rig was not known well enough, or detector or robot err.
+        A scene that stands still excludes a motion: then the rig was inaccurate, or the detector or the robot is wrong.
         Returns frames that may improve the rig.
         """
         first, last = self.settings.registration_frames
         self._since = self._since[-max(last, 30) :]
         if len(newest := [self.corrected(frame.data) for frame in self._since[-first:]]) < first:
             return []
-        if self._held and self._fits(self.rig, newest):
+        if self._explained and self._fits(self.rig, newest):
             self._settle()
             return []
-        if self._held and self._waiting % first:
-            self._waiting += 1  # as it was: look again in a moment
+        if self._explained and self._attempts % first:
+            self._attempts += 1  # the cause persists: test again in a few frames
             return []
         frames = [self.corrected(frame.data) for frame in self._since]
         joined = Correspondences.join(frames).complete
@@ -225,9 +225,9 @@ class RigTracker:
             found = explain(self._before, frames, past, noise, undecided=len(frames) < last)
             shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
             if found.kind in ("moved", "optics") and self._stands_still(found.rig, joined.x_mm, moved_px):
-                agree, better = self._since[-first:], self._calibrated_anew()
+                agree, better = self._since[-first:], self._recalibrated()
                 if better is None and not self._fits(self._before, newest):
-                    raise ValueError("the scene stands still, so the cameras do: the detector or the robot errs.")
+                    raise ValueError("the scene stands still, so the cameras did not move: the detector or the robot errs.")
                 self._revert(result.index)
                 if better is not None:
                     self._use(better)
@@ -236,21 +236,21 @@ class RigTracker:
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
-            self.state, self._held = "moved", False
-            # The oldest may be from before, or from during the motion.
+            self.state, self._explained = "moved", False
+            # The oldest frames may be from before or during the motion.
             self._since = self._since[1 - 2 * first :]
-            self._waiting += 1
+            self._attempts += 1
             self.cause = str(error)
             patience = _PATIENT if (moved_px < _STILL_PX).all() else 1
-            if self._waiting > patience * self.settings.give_up_frames:
-                self._start_again(self._since, "no cause explains the images; calibrating afresh")
+            if self._attempts > patience * self.settings.give_up_frames:
+                self._start_again(self._since, "no cause explains the images; calibrating again")
             raise
         if found.kind == "open":
-            self.cause = self.cause if self._held else found.text
+            self.cause = self.cause if self._explained else found.text
         elif shifted:
             self._revert(result.index)
             self.state, self.cause = "robot" if found.kind in ("clock", "slipped") else "moved", found.text
-            self._held, self._waiting = True, 1
+            self._explained, self._attempts = True, 1
             self._since = self._since[1 - first :]
             result.failures["robot"] = found.text
         elif found.kind == "optics":
@@ -271,23 +271,23 @@ class RigTracker:
         return []
 
     def _revert(self, index: int) -> None:
-        """Go back to the rig before the motion, and doubt the surfaces that the other rig made."""
+        """Return to the rig before the motion, and doubt the surfaces that were made with the other rig."""
         if self.rig is not self._before:
             self._astray = range(self._astray.start, index)
         self.rig, self._motion = self._before, self._motion_before
 
     def _settle(self) -> None:
-        """What happened is over, or known well enough."""
+        """Continue with the rig in use: the disagreement is over, or the motion is known well enough."""
         self.state, self.cause, self.doubted_since = "tracking", "", None
-        self._before, self._since, self._waiting, self._held = None, [], 0, False
+        self._before, self._since, self._attempts, self._explained = None, [], 0, False
         self._monitor.follow(self.rig)
         self._recent.clear()
         self._monitor.forget()
 
-    def _calibrated_anew(self) -> Calibration | None:
-        """By the frames since, too, if that explains the newest: the cameras stood still and were not known well enough."""
+    def _recalibrated(self) -> Calibration | None:
+        """A calibration with the frames since as well, if it explains the newest: then only the rig was inaccurate."""
         first = self.settings.registration_frames[0]
-        if self._given or self._motion_before is not None or self._online is not None or self._waiting % first:
+        if self._given or self._motion_before is not None or self._online is not None or self._attempts % first:
             return None
         with suppress(ValueError):
             found, kept = self._agreed([*self._frames, *self._since])
@@ -298,7 +298,7 @@ class RigTracker:
         return None
 
     def _stands_still(self, rig: StereoRig, x_mm: np.ndarray, moved_px: np.ndarray) -> bool:
-        """Whether `rig`, in place of the one before, would move the landmarks in an image whose scene hardly moved."""
+        """True if `rig`, compared with the one before, shifts the landmarks in an image whose scene hardly moved."""
         step = np.stack(rig.project(x_mm)) - np.stack(self._before.project(x_mm))
         farther = np.median(np.linalg.norm(step, axis=2), axis=1) > _NOISE_PX + _TIMES * moved_px
         return bool((farther & (moved_px < _STILL_PX)).any())
@@ -308,7 +308,7 @@ class RigTracker:
         return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= CONVINCING * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
-        """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
+        """The rows with calibrated offsets added; shut or crossed jaws take the tool's axes from the frames before."""
         offsets = None if self.calibration is None else self.calibration.offsets
         if offsets is None:
             return data
@@ -317,9 +317,9 @@ class RigTracker:
         return with_offsets(self._with_past(data), offsets).of_frames(data.frame)
 
     def robots_error(self, data: Correspondences) -> tuple[np.ndarray, np.ndarray]:
-        """(3, 3) mm from the reported landmarks of a frame to those of the tool, and the covariance (3, 3, 3) of that.
+        """The robot's error: (3, 3) mm from the reported landmarks of a frame to the true ones, and its covariance (3, 3, 3).
 
-        This is the part of the calibrated offsets that is the robot's error; the detector's own is no place of the tool.
+        It is a part of the calibrated offsets.  The rest is the detector's own error, which does not displace the tool.
         """
         offsets = None if self.calibration is None else self.calibration.offsets
         if offsets is None or offsets.offset.shape != (3, 3):
@@ -332,36 +332,36 @@ class RigTracker:
         return part @ axes.T, axes @ covariance @ axes.T
 
     def _with_past(self, data: Correspondences) -> Correspondences:
-        """The rows of a frame after those of the trusted frames before it."""
+        """The rows of the trusted frames before a frame, then its own."""
         past = (part for part in (*self._open, *self._past) if int(part.frame[0]) not in self._doubtful)
         return Correspondences.join([*(part for part in past if part.frame[-1] < data.frame[0]), data])
 
     def _is_open(self, data: Correspondences) -> bool:
-        """Whether a frame tells the tool's axes, however its landmarks are off: the tips are too far apart to be crossed."""
+        """True if the axes are certain: the tips are so far apart that they are not crossed, whatever their offsets."""
         x, offsets = data.grid("x_mm")[0], None if self.calibration is None else self.calibration.offsets
         apart = 0.0 if offsets is None else np.linalg.norm(np.diff(offsets.offset[1:], axis=0))
         return bool(np.linalg.norm(x[2] - x[1]) > apart + 0.05 * np.linalg.norm((x[1] + x[2]) / 2 - x[0]))
 
     @property
     def persistence(self) -> float:
-        """Variance that the mean of many frames keeps, over that of independent ones; 1 before it is known."""
+        """Variance of the mean of many frames, relative to independent errors; 1 before it is known."""
         return 1.0 if self._monitor is None else max(1.0, self._monitor.inflation)
 
     def detection_covariance(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2 of detections alone."""
+        """(n, 4, 4) px^2: covariance of the detections alone."""
         if self.calibration is None:
             return np.tile(self._noise_px**2 * np.eye(4), (len(data), 1, 1))
         return self._scale2 * self.calibration.detection_covariance(data)
 
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
+        """(n, 3, 3) mm^2: covariance of points in the robot's frame by the errors of the rig."""
         own = np.zeros((len(x_mm), 3, 3))
         if self.calibration is not None:
             own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
         left, right = self._motions
         if left is right:
             return own if left is None else own + left.covariance_at(left.transform.inverse().apply(x_mm))
-        # A camera alone does not know its shift along its own view, which it does not show; what it shows becomes depth.
+        # If one camera moved alone, its shift along its own view is unknown, but not visible.  So errors are taken in pixels.
         J, pixels = self.rig.jacobian(x_mm), np.zeros((len(x_mm), 4, 4))
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             if motion is not None:
@@ -378,13 +378,13 @@ class RigTracker:
         return (None, None) if self._motion is None else (self._motion.left, self._motion.right)
 
     def _noise(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2 of landmarks' residuals: of the detections, and of the robot's report."""
+        """(n, 4, 4) px^2: covariance of the landmarks' residuals by detections and robot's report."""
         sigma_x = self.settings.robot_accuracy_mm if self.calibration is None else self.calibration.sigma_x_mm
         A = (self._before or self.rig).linear
         return self.detection_covariance(data) + self._scale2 * sigma_x**2 * A @ A.T
 
     def _rig_covariance(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2: by how much the rig is uncertain where these landmarks are."""
+        """(n, 4, 4) px^2: covariance of the rig's projections of these landmarks."""
         covariance, known = np.zeros((len(data), 4, 4)), self.calibration
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
@@ -395,7 +395,7 @@ class RigTracker:
         return covariance
 
 
-@lru_cache(maxsize=64)  # what looks for a cause asks for the same frames again and again
+@lru_cache(maxsize=64)  # the search for a cause corrects the same frames many times
 def _corrected_alone(data: Correspondences, offsets: LandmarkOffsets) -> Correspondences | None:
-    """The corrected rows where open jaws tell their axes by themselves and no offset turns these; None elsewhere."""
+    """The corrected rows if the axes follow from open jaws in this frame and no offset turns them; otherwise None."""
     return with_offsets(data, offsets) if not offsets.turns and np.isfinite(rows_axes(data)).all() else None

@@ -1,4 +1,4 @@
-"""The online system to watch: both views with landmarks, distances over time with their band, states, times of stages."""
+"""A video of the online system: both images with landmarks, distances over time with their sd, states, times of stages."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -19,13 +19,13 @@ _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 
 
 
 class Dashboard:
-    """Draws each frame as one image (720, 1280, 3) uint8 RGB; its curve shows the distances of the newest `frames`."""
+    """Draws each result as one image (720, 1280, 3) uint8 RGB, with a curve of the distances in the newest `frames`."""
 
     def __init__(self, frames: int = 250) -> None:
         self._past: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=frames)  # distances and their standard deviations
 
     def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
-        """The page of a frame."""
+        """The image for one frame."""
         page = np.full((_SIZE[1], _SIZE[0], 3), 250, np.uint8)
         u = np.stack([result.landmarks.u_left, result.landmarks.u_right])
         views = overlay(StereoFrame(left, right, result.time_s), u, None, min(637, 360 * left.shape[1] // left.shape[0]))
@@ -79,7 +79,7 @@ def _text(image: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, 
 
 @contextmanager
 def video_file(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """A function that adds a page of `Dashboard.draw` to an MP4 file; a ValueError if the file cannot be written."""
+    """Yields a function that adds an image of `Dashboard.draw` to an MP4 file; a ValueError if it cannot be written."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, _SIZE)
     if not writer.isOpened():
         raise ValueError(f"{path}: the video cannot be written; does the folder exist, does it end with .mp4?")

@@ -32,7 +32,7 @@ _LEAST_LENGTH_MM = 1.0  # larger than the error of any tool calibration
 _LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # lengths of the tool that are tried, if the robot's report lacks it
 _AS_GOOD = 6.0  # gain in log likelihood of moved cameras (16 numbers) over a slipped tool (3) that rules the latter out
 _OPENED = 1.25  # a smaller factor may come from constant offsets of the tips, which do no harm
-_RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than this in so many frames, noise included
+_RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
 _BENDS = 1.5  # least motion of a bent tool's tips, as a multiple of the error that the detector states for the base
 _UNFIT_SHARE = 0.2  # least share of gross errors in the landmarks of an unfit detector; fewer do no harm
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
@@ -304,8 +304,8 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
     both, half = problem.used.all(axis=1), problem.used.sum() / 2.0
     distances = affine_epipolar(problem.y[both].reshape(-1, 4))[0]  # all NaN if there are few
-    witness = distances[off[both].any(axis=1)]
-    epipolar = float(np.sqrt(2.0) * np.quantile(witness, 0.75 if off is far else 0.5)) if witness.size else np.nan
+    of_off = distances[off[both].any(axis=1)]
+    epipolar = float(np.sqrt(2.0) * np.quantile(of_off, 0.75 if off is far else 0.5)) if of_off.size else np.nan
     gain = half * (share * np.log(max(share, 1e-9) / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     if epipolar < 0.25 * missed and missed > case.robot_mm * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
@@ -402,7 +402,7 @@ def diagnose(
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
     if moved_px < _STILL_PX and moved_mm > _STILL_MM:
-        text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
+        text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver; record again."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     log = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
     whole = case = Case(problem, *log)

@@ -99,8 +99,8 @@ class Health:
         """The share of bad landmarks, in words without a full stop."""
         if not self.seen.any():
             return "No frame has a landmark"
-        what = "themselves, the other image or the robot" if "robot" in self.parts else "themselves or the other image"
-        return f"{100 * self.unhealthy:.0f} % of the landmarks found contradict {what}"
+        what = "the other image, the robot or themselves" if "robot" in self.parts else "the other image or themselves"
+        return f"{100 * self.unhealthy:.0f} % of the detected landmarks contradict {what} when mirrored or shifted"
 
 
 def health(

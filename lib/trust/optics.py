@@ -26,7 +26,7 @@ _INDEPENDENT_HZ = 3.0  # frames per second with independent evidence of where th
 #: Standard deviations of 1/distance from 0 at which its sign is certain: errors that last from frame to frame make 8 worth 6.
 SURE_CURVED = 8.0
 _CURVED_FITS = 0.01  # misfit below which 1/distance can be interpreted
-_SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
+_SCALE = "Check the units and the scale of the {} columns of kinematics.csv against the other columns."
 _ODD_PIXELS = "The cameras' pixels are skewed or oblong. No axis of the robot is the cause: the jaws keep their lengths."
 _STEADY = "Look for what bends, or changes while you record: shaft, microscope, clock. Resized images do no harm."
 
@@ -40,8 +40,8 @@ def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
     text += f"1/distance is {value:.5f} +- {sd:.5f} per mm."
     cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
     n = 2.0 * case.problem.used.sum()
-    beside = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald's test as a ratio of likelihoods
-    raw = min(case.null.total - replace(case.problem, nearness_sd=1e-9).fit(start=case.null.start).total, beside)
+    wald = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald test as a log likelihood ratio
+    raw = min(case.null.total - replace(case.problem, nearness_sd=1e-9).fit(start=case.null.start).total, wald)
     yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=raw)
 
 
