@@ -177,7 +177,8 @@ def robots_part(found: LandmarkOffsets, own_sd_mm: np.ndarray) -> tuple[np.ndarr
     width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd_mm**2)
-    return share * found.offset, np.hypot(np.sqrt(share) * own_sd_mm, _ODD * share * found.offset)[:, :, None] ** 2 * np.eye(3)
+    variance = share * own_sd_mm**2 + (_ODD * share * found.offset) ** 2
+    return share * found.offset, variance[:, :, None] * np.eye(3)
 
 
 def estimate_offsets(

@@ -99,8 +99,9 @@ class Health:
         """The share of bad landmarks, in words without a full stop."""
         if not self.seen.any():
             return "No frame has a landmark"
-        what = "the other image, the robot or themselves" if "robot" in self.parts else "the other image or themselves"
-        return f"{100 * self.unhealthy:.0f} % of the detected landmarks contradict {what} when mirrored or shifted"
+        names = {"epipolar": "the other image", "robot": "the robot", "looks": "themselves when mirrored or shifted"}
+        what = " or ".join(text for name, text in names.items() if name in self.parts)
+        return f"{100 * self.unhealthy:.0f} % of the detected landmarks contradict {what}"
 
 
 def health(
