@@ -171,13 +171,17 @@ class Calibration:
         J = self.derivatives(x_mm)[1]
         return J @ self.parameter_covariance @ np.swapaxes(J, 1, 2)
 
-    def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
-        """(n, 3, 3) mm^2 of triangulated points, from the calibration's uncertainty and, if `detection`, the pixel noise."""
+    def point_covariance(self, x_mm: ArrayLike, *, detection: bool | np.ndarray = True) -> np.ndarray:
+        """(n, 3, 3) mm^2 of triangulated points, from the calibration's uncertainty and that of the detections.
+
+        The latter is `noise_px2`, or a covariance (n, m, m) px^2; with False the detections are exact.
+        """
         J = self.pair.jacobian(x_mm)
         gain = np.linalg.solve(J.mT @ J, J.mT)  # the noise is the same in every pixel coordinate
-        return gain @ (self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)) @ np.swapaxes(gain, 1, 2)
+        noise_px2 = self.noise_px2 if detection is True else detection
+        return gain @ (self.projection_covariance(x_mm) + noise_px2) @ np.swapaxes(gain, 1, 2)
 
-    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:
+    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool | np.ndarray = False) -> np.ndarray:
         """(n,) standard deviation of triangulated points along the mean viewing direction, for maps of the workspace."""
         direction = sum(camera.viewing_direction for camera in self.cameras)
         direction = direction / np.linalg.norm(direction)
