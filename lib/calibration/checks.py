@@ -107,11 +107,11 @@ def sides(A: np.ndarray) -> tuple[float, float]:
 def eyes_exchanged(A: np.ndarray, sd_rad: float) -> bool:
     """True if the left camera of a stereo head A (4, 3) is certainly on the right.
 
-    This needs images rotated by at most 30 degrees to each other, axes that converge by 1 to 30 degrees, a baseline along
-    the image rows, and a baseline of the wrong sign by at least five standard deviations `sd_rad` of the convergence.
+    This needs images rotated by at most 30 degrees to each other, axes that converge by 1 to 30 degrees, a baseline within
+    34 degrees of the image rows, and one of the wrong sign by at least five standard deviations `sd_rad` of the convergence.
     """
     rows = A / np.linalg.norm(A, axis=1, keepdims=True)
     if (rows[:2] * rows[2:]).sum(axis=1).min() < np.cos(np.deg2rad(30)):
         return False
     along, across = sides(A)
-    return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad))
+    return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(1.5 * abs(across), 5.0 * sd_rad))
