@@ -31,5 +31,5 @@ def test_the_depth_of_one_detected_point_is_that_of_most():
     for vague_px in (1.5, 30.0):
         sd_px = np.where(np.arange(90) % 3 == 0, vague_px, 1.5)[:, None, None, None]
         rows = replace(c, covariance_px2=sd_px**2 * np.broadcast_to(np.eye(2), (90, 2, 2, 2)))
-        told.append(float(re.search(r"depth +(\d+) um sd", report(calibrate(rows)))[1]))
+        told.append(float(re.search(r"depth +sd (\d+) um", report(calibrate(rows)))[1]))
     assert told[1] < 1.5 * told[0]
