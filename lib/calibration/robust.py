@@ -95,7 +95,7 @@ def _one_camera(
         raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
-        what = f"no affine camera agrees with the rows: the best one errs by {found.sigma_px:.3g} px in {count} of {n}"
+        what = f"no affine camera agrees: the best one errs by {found.sigma_px:.3g} px in {count} of {n} rows"
         loose = 2 * count > n and found.sigma_px < _LOOSE * _LARGEST_NOISE[0] * extent
         kind = LooseCameraError if loose else NoConsensusError
         raise kind(f"{name}: no consensus, {what}, and the others are not clearly separated; {cure}.")
