@@ -282,7 +282,7 @@ def _calibrate(
         if refuse.eyes_exchanged(found.rig.linear, sd_rad):
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
             what = f"the cameras are swapped, the left one is {degrees:.1f} degrees to the right of the right one"
-            cure = "exchange u_left and u_right (or flip both images, if mirrored; turn both, if upside down)"
+            cure = "exchange u_left and u_right (if mirrored flip both images, or one axis of x_mm; if upside down turn both)"
             raise DataError(f"u: {what}; {cure}.  checks=False takes them as they are.")
     return found
 

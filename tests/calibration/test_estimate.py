@@ -491,6 +491,12 @@ def test_swapped_eyes_of_a_head_whose_images_are_both_turned_are_refused():
         assert not eyes_exchanged(rig.linear, 0.001)
 
 
+def test_a_mirrored_axis_that_looks_like_swapped_eyes_is_named_beside_them():
+    x, u = good()
+    with pytest.raises(ValueError, match="swapped.*one axis of x_mm"):
+        calibrate(x * [1, -1, 1], u)
+
+
 def test_a_head_whose_geometry_leaves_doubt_is_not_called_swapped():
     x, (u_left, u_right) = good()
     calibrate(x, [u_right, np.column_stack([1919 - u_left[:, 0], u_left[:, 1]])])  # one channel mirrored
