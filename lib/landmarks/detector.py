@@ -487,11 +487,11 @@ class Detector:
         if (stride == 1).all():
             return images
         size = tuple(int(v) for v in np.round(images.shape[2:0:-1] / stride))
-        how = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
+        method = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
         if stride.min() >= 4:  # halving first is faster in OpenCV
             half = tuple(side // 2 for side in images.shape[2:0:-1])
-            images = [cv2.resize(image, half, interpolation=how) for image in images]
-        return np.stack([cv2.resize(image, size, interpolation=how) for image in images])
+            images = [cv2.resize(image, half, interpolation=method) for image in images]
+        return np.stack([cv2.resize(image, size, interpolation=method) for image in images])
 
     def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
         """Convert peaks to landmarks in pixels of the stage's input; `landmark` is the index of each peak's landmark."""

@@ -41,7 +41,7 @@ def openvino():
 
 
 def default_engine() -> str:
-    """``"cuda"`` where there is an NVIDIA GPU, else ``"openvino"`` where it is installed, else ``"torch"``.
+    """``"cuda"`` if there is an NVIDIA GPU, else ``"openvino"`` if it is installed, else ``"torch"``.
 
     >>> default_engine() in ENGINES
     True

@@ -18,7 +18,7 @@ _CONVERGED = 1e-4
 
 
 def sigma_cells(stride: int, sigma_px: float = SIGMA_PX) -> float:
-    """Sigma in cells, at lower 0.6: a narrower Gaussian would fall between the cells (at stride 64, of the encoder)."""
+    """Sigma in cells, at least 0.6: a narrower Gaussian would fall between the cells (at stride 64, of the encoder)."""
     return max(sigma_px / stride, 0.6)
 
 
@@ -102,7 +102,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc by lower squares, started from the paper's disc centroid.
+    """Fit a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc by least squares, started from the paper's disc centroid.
 
     The five unknowns are x, y, width w, height a and offset b.  Steps are damped and limited.  A fit that leaves the disc, or
     has a width below 0.4 or above 2.5, is replaced by the centroid with variance sigma^2.  Returns x and y, w, covariance.

@@ -217,7 +217,7 @@ def bent(
 def _turned(
     image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarray, turn: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate what lies `ahead` of the elbow by up to `turn` rad; the rotation decreases to 0 from `reach` to 2 `reach` px."""
+    """Rotate what lies `ahead` of the elbow, within `reach` px, by up to `turn` rad; at 2 `reach` the rotation ends."""
     radius, first = 2.0 * reach, np.arctan2(*ahead[::-1])
     low = np.clip(np.floor(elbow - radius), 0, image.shape[1::-1]).astype(int)
     high = np.clip(np.ceil(elbow + radius) + 1, 0, image.shape[1::-1]).astype(int)

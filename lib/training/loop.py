@@ -293,7 +293,7 @@ class Run:
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
     def _graphed(self, images: Tensor) -> Callable[[Tensor], list[Tensor]]:
-        """Capture the network as CUDA graphs: a step is a thousand small kernels, and launching one takes longer than it."""
+        """Capture the network as CUDA graphs: a step has a thousand kernels, which take longer to launch than to run."""
         before = copy.deepcopy(self.network.state_dict())  # a capture changes the statistics of batch normalisation
         torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)  # meaningless for a capture
         graphed = torch.cuda.make_graphed_callables(copy.copy(self.network), (images,))
@@ -311,7 +311,7 @@ class Run:
         write_checkpoint(path, tensors, {"format": FORMAT, "config": asdict(self.config), "provenance": provenance} | state)
 
     def restore(self, path: Path, provenance: dict[str, object]) -> None:
-        """Load the state from a checkpoint, and complete `provenance`.  Raises ValueError if it is of another training."""
+        """Load the state from a checkpoint, and complete `provenance`.  Raises ValueError if it is another training's."""
         tensors, metadata = read_checkpoint(path, FORMAT)
         changed, kept = self.config.changed(metadata["config"]), metadata["provenance"]
         processes = kept.get("processes", 1)

@@ -71,8 +71,8 @@ def make_shard(path: Path, kind: str, index: int, photographs: Sequence[Path] = 
     sizes = HELD_OUT_SIZES if kind == "held_out" else ((SCENE_PX, round(SCENE_PX * 9 / 16)),)
     textures = VALIDATION_TEXTURE_SEEDS if kind == "held_out" else TEXTURE_SEEDS
     names = rng.choice(list(shares), n, p=list(shares.values())).tolist()
-    how = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
-    drawn = (sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **how) for name in names)
+    options = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
+    drawn = (sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **options) for name in names)
     ends, jpegs, u, visibility = packed(LabelledImage(name, *one) for name, one in zip(names, drawn, strict=True))
     with whole(path) as partial:
         np.savez(partial, jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
@@ -86,8 +86,8 @@ def _write_closeups(path: Path, rng: np.random.Generator, photographs: Sequence[
         while not seen[i, k]:
             # A third shows the reference rig, where the last tenth of a pixel counts.
             population = "near" if rng.random() < 1 / 3 else "training"
-            how = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
-            image, at, seen[i] = sample(rng, crop_px=rendered_px, photographs=photographs, **how)
+            rest = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
+            image, at, seen[i] = sample(rng, crop_px=rendered_px, photographs=photographs, **rest)
         crops[i], u[i] = square_round(image, at, k, side_px)  # at the field's border the landmark is off-centre
     with whole(path) as partial:
         np.savez(partial, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)

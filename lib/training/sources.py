@@ -155,7 +155,7 @@ class ToolSource(SceneSource):
         return _mirrored(*self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng), rng if self.disguise else None)
 
     def _proposed(self, scene, tool: np.ndarray, rng: np.random.Generator):
-        """The window of a tool (3, 2) px that a first stage proposed: labelled if it shows the tool, else with none."""
+        """The window of a tool (3, 2) px that a first stage proposed, labelled if it shows the tool, else without one."""
         (centre, own), (angle, direction) = windows.tool_pose(np.stack([tool, scene[1]]))
         zoom = windows.tool_zoom(max(_length_px(tool, np.ones(3)), SHORTEST_PX)) * np.exp(rng.normal(0, 0.1))
         centre, angle = centre + rng.normal(0, 4, 2) / zoom, angle + rng.normal(0, 0.1)
@@ -188,7 +188,7 @@ class ToolSource(SceneSource):
 
 
 def _mirrored(image, u, visibility, rng: np.random.Generator | None):
-    """Exchange top and bottom, and so the tips, with probability 1/2; not without `rng`."""
+    """Exchange top and bottom, and so the tips, with probability 1/2; never without `rng`."""
     if rng is None or rng.random() < 0.5:
         return image, u, visibility
     u = np.column_stack([u[:, 0], image.shape[0] - 1 - u[:, 1]])[[0, 2, 1]]
