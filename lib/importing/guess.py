@@ -1,6 +1,6 @@
-"""A first mapping from the files of a folder, with a comment at each line; CHECK marks what only a person can know.
+"""Guesses a first mapping from the files of a folder.  Each line has a comment; CHECK marks what only a person can know.
 
-Units that no column's name states are those in which the log's steps and motion are plausible.
+Where a column's name states no unit, the guess is the unit in which the log's time steps and motion are plausible.
 """
 
 import re
@@ -26,7 +26,7 @@ _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_s
 
 
 def guess_mapping(source: str | Path) -> str:
-    """The text of a mapping file for the files in a folder, which needs a video or images, and a robot's log."""
+    """The text of a mapping file for the files in a folder, which must hold a video or images, and a robot's log."""
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
@@ -36,21 +36,21 @@ def guess_mapping(source: str | Path) -> str:
     robot = _robot(folder, paths, tables)
     estimate = "pose" in robot and bool(labels)
     robot["offset_s"] = 0.0 if estimate else "estimate"
-    open_yet = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}
-    measured = {"landmarks_mm": {"base": [0.0] * 3}, "hinge": open_yet} if "pose" in robot else {}
-    told = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
+    hinge = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}  # zeros are refused until measured
+    to_measure = {"landmarks_mm": {"base": [0.0] * 3}, "hinge": hinge} if "pose" in robot else {}
+    guess = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
     video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
-    told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot}
-    told |= {"tool": {"estimate": True} if estimate else measured, "labels": _labels(labels)}
-    tells = read_toml(Path(__file__).with_name("comments.toml"))
+    guess |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot}
+    guess |= {"tool": {"estimate": True} if estimate else to_measure, "labels": _labels(labels)}
+    comments = read_toml(Path(__file__).with_name("comments.toml"))
+    if "pose" in robot and "rotation" not in robot["pose"]:
+        comments["robot.pose"] = comments["robot.rotation"]
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
-    for key, value in told.items():
+    for key, value in guess.items():
         table = key in ("video", "robot", "tool", "labels")
         lines = {f"{key}.{inner}": entry for inner, entry in value.items()} if table else {key: value}
         text += f"\n[{key}]\n" if table and value else ""
-        open_rotation = key == "robot" and "pose" in robot and "rotation" not in robot["pose"]
-        told_of = tells | ({"robot.pose": tells["robot.rotation"]} if open_rotation else {})
-        text += "".join(f"{k.split('.')[-1]} = {toml(v)}  # {told_of[k]}\n" for k, v in lines.items())
+        text += "".join(f"{k.split('.')[-1]} = {toml(v)}  # {comments[k]}\n" for k, v in lines.items())
     return text
 
 
@@ -71,7 +71,7 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
     times = {"times": "container"}
     seconds = [] if films else decimals(list(folder.glob(left)))
-    if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else cam_1.0001 is frame 1
+    if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else numbers: cam_1.0001 is frame 1
         times = {"times": "names", "name_unit": "s"}
     elif not films and digits >= 10:
         times = {"times": "names", "name_unit": {10: "s", 13: "ms", 16: "us"}.get(digits, "ns")}
@@ -90,7 +90,7 @@ def _frame_times(tables: dict[str, Path], frames: int) -> dict:
 
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Separator and decimal mark, and the cells of each column."""
+    """Separator and decimal mark of a table, and the cells of each column."""
     lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()]
     separator = separator_of(lines[0]) if lines else ","
     header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
@@ -100,13 +100,13 @@ def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
 
 
 def _numbers(cells: list[str], decimal: str) -> np.ndarray:
-    """The numbers in some cells of a column; of other text NaN."""
+    """The numbers in a sample of a column's cells; NaN for other text."""
     some = [cell.replace(decimal, ".") for cell in cells[:: max(1, len(cells) // 2000)]]
     return np.array([float(cell) if re.fullmatch(r"[-+\d.eE]+", cell) else np.nan for cell in some])
 
 
 def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
-    """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
+    """The column of the times and their unit, which its name states, or else its steps: rows are 1 ms to 3 s apart."""
     time = next(filter(_TIME.search, columns), next(iter(columns)))
     if any(":" in cell for cell in columns[time][:1]):
         return {"time": time, "time_unit": "hms" if re.match(r"\d\d?:\d\d?:", columns[time][0]) else "iso"}
@@ -131,23 +131,23 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
             groups.setdefault(match[1], {})[match[2].lower()] = column
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
-        raise ValueError(f"{tables[name]}: no three columns end in x, y and z; it has {list(columns)}. Write it by hand.")
+        raise ValueError(f"{tables[name]}: no columns end in x, y and z; it has {list(columns)}. Write the mapping by hand.")
     length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")
-    if not length:  # a tool moves over a millimetre to some centimetres
+    if not length:  # a tool moves by one millimetre to some centimetres
         axes = (_numbers(columns[column], dialect["decimal"]) for column in next(iter(points.values())))
         span = max(float(np.ptp(known)) if len(known := x[np.isfinite(x)]) else 1.0 for x in axes)
         length = "m" if span < 0.3 else "um" if span > 2000 else "mm"
-    told = {"file": name, **dialect, **time, "length_unit": length}
+    guess = {"file": name, **dialect, **time, "length_unit": length}
     if len(points) > 1 and not turn:
-        return told | {"landmarks": _matched(points)}
+        return guess | {"landmarks": _matched(points)}
     pose = {"position": points[min(points, key=lambda prefix: "pos" not in prefix.lower())], **turn}
     if jaw := next((column for column in columns if re.search(r"(?i)grip|jaw|open", column)), ""):
         pose |= {"gripper": jaw, "gripper_unit": next((unit for unit in ("deg", "mm") if unit in jaw.lower()), "rad")}
-    return told | {"pose": pose}
+    return guess | {"pose": pose}
 
 
 def _rotation(columns: dict[str, list[str]], decimal: str) -> dict:
-    """The columns of the tool's rotation and its kind: a quaternion by its names, or numbered columns with such values."""
+    """The columns of the tool's rotation and its kind: a quaternion by names, or numbered columns that hold a rotation."""
     fours = ([c[:-1] + axis for axis in axes] for c in columns for axes in ("xyzw", "XYZW") if c[-1:] == axes[3])
     if four := next((four for four in fours if set(four) <= columns.keys()), []):
         return {"rotation": four, "rotation_kind": "quaternion_xyzw"}
@@ -168,17 +168,17 @@ def _bag(folder: Path, name: str) -> dict:
     kinds = topics_of(folder / name)
     points, poses = ([topic for topic, kind in kinds.items() if kind == wanted] for wanted in ("PointStamped", "PoseStamped"))
     if not poses and len(points) < 2:
-        raise ValueError(f"{folder / name}: no PoseStamped, no two PointStamped; it has {kinds}. Write it by hand.")
-    told = {"file": name, "length_unit": "m", "time": f"{(points if len(points) > 1 else poses)[0]}:header.stamp"}
+        raise ValueError(f"{folder / name}: no PoseStamped, no two PointStamped; it has {kinds}. Write the mapping by hand.")
+    guess = {"file": name, "length_unit": "m", "time": f"{(points if len(points) > 1 else poses)[0]}:header.stamp"}
     if len(points) > 1:
-        return told | {"landmarks": _matched({topic: [f"{topic}:point.{axis}" for axis in "xyz"] for topic in points})}
+        return guess | {"landmarks": _matched({topic: [f"{topic}:point.{axis}" for axis in "xyz"] for topic in points})}
     pose = {"position": [f"{poses[0]}:pose.position.{axis}" for axis in "xyz"]}
     pose |= {"rotation": [f"{poses[0]}:pose.orientation.{axis}" for axis in "xyzw"], "rotation_kind": "quaternion_xyzw"}
-    return told | {"pose": pose}
+    return guess | {"pose": pose}
 
 
 def _matched(theirs: dict[str, object]) -> dict[str, object]:
-    """What belongs to each of our names: names alike but for case and signs, else in their order."""
+    """The entry for each of our landmarks: by name, apart from case and punctuation, else in their order."""
     bare = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in (*theirs, *LANDMARKS)}
     if len(theirs) != len(LANDMARKS):
         return {f"point_{bare[name]}": value for name, value in theirs.items()}

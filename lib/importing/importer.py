@@ -1,4 +1,4 @@
-"""From foreign files to a recording: everything is read and checked, then the recording appears whole."""
+"""Turns the files of other programs into a recording.  All of them are checked first, and it appears whole or not at all."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -22,66 +22,65 @@ from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
 from lib.recordings import Annotations, Kinematics, Recording, RecordingWriter
 
-_LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is another
-_CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
-_EPOCH_S = 1_000_000  # larger times count from a date: 100 ns would drown in a float
+_LOG_STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
+_CLOCK_FRAMES = 60  # number of frames in which the landmarks are detected for the clock offset, if there are no labels
+_EPOCH_S = 1_000_000  # larger times count from a date; as floats they would not resolve 100 ns, so a zero is subtracted
 
 
 def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *, overwrite: bool = False) -> dict:
-    """Write the recording `out` from the files in the folder `source`, which is never changed, as a mapping file says.
+    """Write the recording `out` from the files that a mapping describes.  The folder `source` is never changed.
 
-    The same input gives the same bytes.  Errors name the file and the cure, and then nothing is written.
+    The same input gives the same bytes.  An error names the file and the cure; then nothing is written.
 
-    Returns what stands in the recording's import.json: "did" in plain sentences, "clock", "tool", "sources" with SHA-256.
+    Returns the content of import.json: what was done ("did", in sentences), "clock", "tool", "sources" with SHA-256, ...
     """
     folder, out = Path(source), Path(out)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder that holds the files of the mapping.")
     if out.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
+        raise ValueError(f"{out}: lies in the source, which an import does not change; choose another folder.")
     if any(Path(path).resolve().is_relative_to(out.resolve()) for path in (folder, mapping)):
         raise ValueError(f"{out}: holds your files, and --overwrite replaces all of it; choose another --out.")
-    told = read_mapping(mapping)
-    stereo = open_stereo(folder, told.video)
-    robot_time, *reported = read_robot(folder, told)
-    increasing(robot_time, str(folder / told.robot.file), *_LOG_STEP_S)
-    # A recording's times count from 0, or from the first whole second of times that count from a date.
-    # So do times of day, unless both tables have such.
-    of_day = [table is not None and table.time_unit == "hms" for table in (told.video.table, told.robot)]
+    spec = read_mapping(mapping)
+    stereo = open_stereo(folder, spec.video)
+    robot_time, *reported = read_robot(folder, spec)
+    increasing(robot_time, str(folder / spec.robot.file), *_LOG_STEP_S)
+    # Subtract the first whole second of times that count from a date, and of times of day unless both tables have such.
+    of_day = [table is not None and table.time_unit == "hms" for table in (spec.video.table, spec.robot)]
     starts = [stereo.time[0], robot_time[0]]
     dated = [abs(t) > _EPOCH_S or (day and not all(of_day)) for t, day in zip(starts, of_day, strict=True)]
     zeros = stereo_zero, robot_zero = [Decimal(int(t) if date else 0) for t, date in zip(starts, dated, strict=True)]
-    one_dated = bool(stereo_zero) != bool(robot_zero)  # the other starts at 0
-    estimated = told.robot.offset_s == "estimate"
-    given = Decimal("0" if estimated else str(told.robot.offset_s))
+    one_dated = bool(stereo_zero) != bool(robot_zero)  # then the search assumes that log and video began together
+    estimated = spec.robot.offset_s == "estimate"
+    given = Decimal("0" if estimated else str(spec.robot.offset_s))
     offset_s = 0.0 if estimated and one_dated else float(stereo_zero + given - robot_zero)
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
-    labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
+    labels = read_labels(folder, spec.labels, stereo, spec.landmarks, size) if spec.labels else None
     frames_s = time_s + offset_s
     if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
         spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
         what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
         low, high = sorted(robot_time[end] - stereo.time[end] for end in (0, -1))
         cure = f"a number from {low:.3f} to {high:.3f}, so that they overlap (t_robot = t_video + offset_s)"
-        cure += ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
-        half_hours = int(float(high) // 1800)  # the most that make them overlap
+        cure += ', or to "estimate" if log and video began together' if one_dated and not estimated else ""
+        half_hours = int(float(high) // 1800)  # the largest offset in half hours that makes them overlap
         if (all(zeros) or all(of_day)) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
             hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
             cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
-        cure = f"Set robot.offset_s (now {told.robot.offset_s!r}) in {mapping} to {cure}"
-        raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
-    if labels is not None:  # the mean instant at which the rows of a frame's labels were read
+        cure = f"Set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
+        raise ValueError(f"{folder / spec.robot.file}: {what}. {cure}.")
+    if labels is not None:  # with a rolling shutter: the mean time at which the rows of a frame's labels were read
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
         mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
-        frames_s += told.readout_s * mean / (size[1] - 1)
-    x_mm, tool_told = _landmarks(told, reported, robot_s, frames_s, labels, float(robot_zero))
+        frames_s += spec.readout_s * mean / (size[1] - 1)
+    x_mm, tool = _landmarks(spec, reported, robot_s, frames_s, labels, float(robot_zero))
     usual_fps = round(1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0, 6)
-    fps = usual_fps if told.video.fps is None else told.video.fps / told.video.every
+    fps = usual_fps if spec.video.fps is None else spec.video.fps / spec.video.every
     writer = RecordingWriter(
-        out, name=told.name, description=told.description, fps=fps, image_size_px=size, readout_s=told.readout_s,
-        offset_s=offset_s, robot_accuracy_mm=told.robot_accuracy_mm, skeleton=told.landmarks, overwrite=overwrite,
-        suffix=f".{told.video.format}", jpeg_quality=told.video.jpeg_quality,
+        out, name=spec.name, description=spec.description, fps=fps, image_size_px=size, readout_s=spec.readout_s,
+        offset_s=offset_s, robot_accuracy_mm=spec.robot_accuracy_mm, skeleton=spec.landmarks, overwrite=overwrite,
+        suffix=f".{spec.video.format}", jpeg_quality=spec.video.jpeg_quality,
     )  # fmt: skip
     try:
         with writer:
@@ -92,30 +91,31 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
             zero_s = float(robot_zero - stereo_zero)
-            clock, found = _clock(draft, told.robot.search_s, zero_s) if estimated else None, None
+            clock, found = _clock(draft, spec.robot.search_s, zero_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            report = {"format": "microstereo.import", "did": _did(told, stereo, draft, clock, zeros), "clock": found}
-            report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
+            report = {"format": "microstereo.import", "did": _did(spec, stereo, draft, clock, zeros), "clock": found}
+            report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
-    except ValueError as error:  # of the unfinished recording, which is gone: its place says more
+    except ValueError as error:  # names the temporary folder of the unfinished recording, which no longer exists
         raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
     return report
 
 
 def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset | str:
-    """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none.
+    """Estimate the clock offset from labels, or from detections if there are none.
 
-    The files' own offset is larger than the draft's by `zero_s`.
+    Returns the reason as a string if the detector does not know the tool.  Errors state offsets between the times in the
+    files, which are larger than offsets of the draft by `zero_s`.
     """
     if (labels := draft.annotations) is not None:
         known = {"u_left": labels.u_left, "u_right": labels.u_right}
     elif draft.skeleton != LANDMARKS:
-        return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"
+        return f"the detector knows only {', '.join(LANDMARKS)}, and there are no labels"
     else:
         some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
-        seen = detect(replace(draft, readout_s=0.0), SharedDetector(), frames=some)  # the pixels as they were found
+        seen = detect(replace(draft, readout_s=0.0), SharedDetector(), frames=some)  # readout 0 keeps the pixels
         known = {name: seen.grid(name) for name in ("u_left", "u_right", "covariance_px2", "confidence")} | {"frames": some}
     paired = partial(of_recording, **known)
     try:
@@ -125,45 +125,45 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
         what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
-        cure = f"Or state a number, where t_robot = t_video + offset_s. {draft.mistimed}".rstrip()
+        cure = f"Or give a number: t_robot = t_video + offset_s. {draft.mistimed}".rstrip()
         raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
-    with suppress(DataError, np.linalg.LinAlgError):  # cameras of their own ask for more
+    with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))
         calibration = calibrate_as_shown(data, image_size_px=draft.image_size_px)
-        step_s, sd_s = clock_error(calibration, data, draft.kinematics, found.offset_s)  # the landmarks' offsets are free
+        step_s, sd_s = clock_error(calibration, data, draft.kinematics, found.offset_s)  # with free landmark offsets
         found = replace(found, offset_s=found.offset_s + step_s, sd_s=sd_s) if np.isfinite(sd_s) else found
     return found
 
 
 def _landmarks(
-    told: Mapping, reported: list, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None, zero_s: float
+    spec: Mapping, reported: list, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None, zero_s: float
 ) -> tuple[np.ndarray, dict | None]:
-    """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
-    x_mm, R, opening = reported  # as `read_robot` has them
+    """The robot's landmarks (m, k, 3) mm; and if it reports poses, the tool's geometry for import.json."""
+    x_mm, R, opening = reported  # as `read_robot` returns them
     if R is None:
         return x_mm, None
     known = np.isfinite(np.hstack([R, x_mm])).all(axis=(1, 2))
     poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
     opening = None if opening is None else opening[known]
-    tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
-    x = np.full((len(known), len(told.landmarks), 3), np.nan)
+    tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    x = np.full((len(known), len(spec.landmarks), 3), np.nan)
     x[known] = tool.positions_mm(poses, opening)
     kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm, "sd_mm": sd}
-    return x, {kind: dict(zip(told.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
+    return x, {kind: dict(zip(spec.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
 
 
 def _tool(
-    told: Mapping, poses: list[RigidTransform], robot_s: np.ndarray, opening: np.ndarray | None, frames_s: np.ndarray,
+    spec: Mapping, poses: list[RigidTransform], robot_s: np.ndarray, opening: np.ndarray | None, frames_s: np.ndarray,
     labels: Annotations | None, zero_s: float,
 ) -> tuple[Tool, np.ndarray]:  # fmt: skip
-    """The landmarks in the tool frame, and the standard deviation (k, 3) of what was estimated."""
-    names, tool = told.landmarks, told.tool
+    """The landmarks in the tool frame, and the standard deviations (k, 3) mm of their offsets, 0 where not estimated."""
+    names, tool = spec.landmarks, spec.tool
     turning = [tool.turning.get(name, 0) if opening is not None else 0 for name in names]
     if tool.estimate:
-        if labels is None or told.robot.offset_s == "estimate":
-            raise ValueError("tool.estimate: it needs labels and a number as robot.offset_s; or give the tool's landmarks.")
+        if labels is None or spec.robot.offset_s == "estimate":
+            raise ValueError("tool.estimate: needs labels, and robot.offset_s as a number; or give the tool's landmarks.")
         reported_mm = Kinematics(robot_s, np.array([[pose.t] for pose in poses])).at(frames_s)[:, 0]
-        inside = np.isfinite(reported_mm).all(axis=1)  # nothing is told in a gap
+        inside = np.isfinite(reported_mm).all(axis=1)  # NaN in a gap of the log
         at, u = frames_s[inside], [side[inside] for side in (labels.u_left, labels.u_right)]
         turns = Slerp(robot_s, Rotation.from_matrix([pose.R for pose in poses]))(at).as_matrix()
         jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
@@ -178,21 +178,21 @@ def _tool(
     hinged = tool.hinge is not None and any(turning)
     if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
         cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge, or tool.estimate = true"
-        raise ValueError(f"robot.pose: the place of {', '.join(lacks)} in the tool frame is open; {cure}.")
+        raise ValueError(f"robot.pose: the position of {', '.join(lacks)} in the tool frame is not given; {cure}.")
     if hinged:
         return Tool.hinged(np.nan_to_num(offset), turning, tool.hinge.point_mm, tool.hinge.axis, tool.hinge.jaw_mm), sd
     return Tool(offset, np.zeros_like(offset), np.zeros_like(offset)), sd
 
 
 def _did(
-    told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
+    spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
 ) -> list[str]:
-    """What the import did, one plain sentence each."""
+    """What the import did, in sentences, one a line of did.txt."""
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
     return Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
-        told=told, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
+        spec=spec, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
         zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],
@@ -202,12 +202,12 @@ def _did(
     ).rstrip().split("\n")  # fmt: skip
 
 
-def _sources(folder: Path, told: Mapping, stereo: StereoSource) -> list[dict]:
-    """What was read, each with its SHA-256; of a folder or a pattern, that of all its files in their order."""
-    videos = (told.video.left, told.video.right) if told.video.layout == "two" else (told.video.file,)
+def _sources(folder: Path, spec: Mapping, stereo: StereoSource) -> list[dict]:
+    """The sources, each with its SHA-256; for a folder or a pattern, one of all its files in order."""
+    videos = (spec.video.left, spec.video.right) if spec.video.layout == "two" else (spec.video.file,)
     names = {name: list(reel.files) for reel, name in zip(stereo.reels, videos, strict=True)}
-    others = [told.robot.file, told.video.table.file if told.video.table else ""]
-    others += [told.labels.file, told.labels.left, told.labels.right] if told.labels else []
+    others = [spec.robot.file, spec.video.table.file if spec.video.table else ""]
+    others += [spec.labels.file, spec.labels.left, spec.labels.right] if spec.labels else []
     for name in filter(None, others):
         path = folder / name
         names[name] = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]

@@ -16,11 +16,11 @@ from lib.recordings import Annotations
 from lib.recordings.annotations import coco_keypoints, inside
 from lib.recordings.tables import decoded, rows_of
 
-_LARGEST_BYTES = 1 << 29  # of a label file; a zip of a few kB may claim any size
+_LARGEST_BYTES = 1 << 29  # largest unpacked label file, because a zip of a few kB can unpack to any size
 
 
 class Label(NamedTuple):
-    """One landmark: the image (its path, or the number of its frame), its name there, pixel and visibility (1 hidden)."""
+    """One labelled landmark: image (path or frame number), the file's name of the landmark, pixel, and visibility 0, 1, 2."""
 
     image: str
     name: str
@@ -32,11 +32,11 @@ class Label(NamedTuple):
 def read_labels(
     folder: Path, labels: Labels, source: StereoSource, landmarks: Sequence[str], image_size_px: tuple[int, int]
 ) -> Annotations:
-    """The labels of the frames that are imported; integer coordinates are pixel centres.
+    """The labels of the imported frames; integer coordinates are pixel centres.
 
-    Labels of other frames are left out.  Where the source holds both views in one image, so may the labels.
+    Labels of other frames are left out.  If an image of the source holds both views, labels may refer to that image.
     """
-    theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
+    index_of = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
     frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]
     of_files = ([n for n in reel.numbers if isinstance(n, int) and not labels.first_frame] for reel in source.reels)
     ends = [(min(own, default=0), max(own, default=0)) for own in of_files]  # lowest and highest number of a file
@@ -45,11 +45,11 @@ def read_labels(
     files = [(labels.file, None)] if labels.file else [(f, s) for s, f in enumerate((labels.left, labels.right)) if f]
     found = [(folder / file, side, label) for file, side in files for label in labels_of(labels.kind, folder / file)]
     known, path = {label.name for _, _, label in found}, folder / files[-1][0]
-    if missing := [name for name in theirs if name not in known]:
+    if missing := [name for name in index_of if name not in known]:
         cure = f"labels.names gives their name for each of {list(landmarks)}"
         raise ValueError(f"{path}: no label is called {missing[0]!r}; it has {sorted(known)}. {cure}.")
     for path, given, label in found:
-        if label.name not in theirs or not label.visibility:
+        if label.name not in index_of or not label.visibility:
             continue
         where = f"{path}: {label.image}, {label.name}"
         xy = np.array([label.x, label.y]) - (0.5 if labels.pixel_origin == "corner" else 0.0)
@@ -62,10 +62,10 @@ def read_labels(
         elif [name in label.image for name in labels.sides].count(True) == 1:
             side = int(labels.sides[1] in label.image)
         else:
-            raise ValueError(f"{where}: the name tells no camera; labels.sides = {list(labels.sides)} must tell one of two.")
+            raise ValueError(f"{where}: the image's name must contain one of labels.sides = {list(labels.sides)}, not both.")
         reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
         image = PurePosixPath(label.image.replace("\\", "/"))
-        # A bare number counts frames.  One in a name is that of a file, unless first_frame says where it counts from.
+        # A bare number counts frames.  A number in a name is that of a file, unless first_frame is given.
         number, of_file = last_number(image), {} if image.name.isdecimal() else source.reels[reel].numbers
         low, high = ends[reel] if of_file else (0, 0)
         nth = None if number is None or low < number < high else number - labels.first_frame
@@ -74,7 +74,7 @@ def read_labels(
             continue
         if not inside(xy, image_size_px):
             raise ValueError(f"{where}: ({xy[0]:.6g}, {xy[1]:.6g}) lies outside the image of {width} x {height} px.")
-        k = theirs[label.name]
+        k = index_of[label.name]
         if v[side, frame, k]:
             raise ValueError(f"{where}: labelled twice; a frame has one tool. Keep one label.")
         u[side, frame, k], v[side, frame, k] = xy, label.visibility
@@ -82,12 +82,12 @@ def read_labels(
         cure = "Check labels.first_frame and the images' names"
         raise ValueError(f"{path}: none of its {len(found)} labels belongs to an imported frame. {cure}.")
     if np.nanmax(u) <= min(100, min(image_size_px) / 4):
-        raise ValueError(f"{path}: no label beyond {np.nanmax(u):.4g} px: fractions or per cent of the image? Export pixels.")
+        raise ValueError(f"{path}: no label beyond {np.nanmax(u):.4g} px; fractions or per cent of the image? Export pixels.")
     return Annotations(*u, *v)
 
 
 def labels_of(kind: str, path: Path) -> Iterator[Label]:
-    """The labels in a file, with one error for whatever a file of another kind makes of its reader."""
+    """The labels in a file of the given kind.  A file of another kind raises a ValueError, whatever its reader raised."""
     read, what = _READERS[kind]
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
@@ -110,7 +110,7 @@ def _cvat(path: Path) -> Iterator[Label]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError(f"{path}: the XML defines entities, which CVAT does not. Export it again.")
     root = fromstring(text)
-    # A track is one landmark of a video; a skeleton's points are nested and have labels of their own.
+    # A track is one landmark of a video; the points of a skeleton are nested and have their own labels.
     for parent in (*root.iter("image"), *root.iter("track")):
         for shape, points in ((s, p) for s in (parent, *parent.iter("skeleton")) for p in s.findall("points")):
             image = parent.get("name") or points.get("frame") or shape.get("frame") or ""
@@ -123,7 +123,7 @@ def _cvat(path: Path) -> Iterator[Label]:
 
 def _from_zip(path: Path, name: str) -> str:
     with ZipFile(path) as archive:
-        for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
+        for entry in archive.namelist():  # nothing is unpacked, but no label tool exports such a file
             if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
                 raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
         if archive.getinfo(name).file_size > _LARGEST_BYTES:
@@ -166,7 +166,7 @@ def _sleap(path: Path) -> Iterator[Label]:
     with h5py.File(path) as file:
         metadata = json.loads(bytes(file["metadata"].attrs["json"]).decode())
         names = [metadata["nodes"][link["id"]]["name"] for link in metadata["skeletons"][0]["nodes"]]
-        corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # SLEAP counted from the corner once
+        corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # older SLEAP: the corner is (0, 0)
         videos = [json.loads(video)["backend"] for video in file["videos_json"][:]]
         instances, points = file["instances"][:], file["points"][:]
         for frame in file["frames"][:]:

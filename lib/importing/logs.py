@@ -1,4 +1,4 @@
-"""Tables of other programs: CSV of any dialect and ROS bags, with exact times; and what a robot's log says in mm and s."""
+"""Reads tables of other programs (CSV of any dialect, ROS bags) with exact times, and the robot's log in mm and s."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -22,7 +22,7 @@ _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
-    """A time as exact seconds; "iso" dates without a zone count as UTC, and "hms" times of day from midnight.
+    """A time as exact seconds.  "iso" dates without a zone count as UTC; "hms" times of day count from midnight.
 
     >>> exact_seconds("1700000000123456789", "ns", "log.csv"), exact_seconds("1970-01-01T00:00:01.5", "iso", "log.csv")
     (Decimal('1700000000.123456789'), Decimal('1.500000'))
@@ -47,7 +47,7 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
 
 
 def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float, unit: str = "time_unit") -> None:
-    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another `unit`."""
+    """Raise a ValueError if the times of rows or frames repeat or go back, or if their median step makes `unit` doubtful."""
     for i, (before, now) in enumerate(pairwise(time), start=2):
         if now <= before:
             what = "repeats" if now == before else "goes back"
@@ -60,10 +60,10 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
 
 
 def uncommented(text: str, separator: str = "") -> list[str]:
-    """The lines of a table; comments and a row of units below the header are blank.
+    """The lines of a table, with comments and a row of units below the header replaced by blanks.
 
-    The last comment before numbers is the header if it has as many cells: `numpy.savetxt` writes headers so.  The separator
-    of its first row is found where none is given.
+    The last comment before rows of numbers is the header if it has as many cells, since `numpy.savetxt` writes headers so.
+    If no separator is given, that of the first row is found.
 
     >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n"), uncommented("t,x\\ns,mm\\n0.1,2\\n")
     (['', 't,x', '0.1,2'], ['t,x', '', '0.1,2'])
@@ -86,12 +86,12 @@ def uncommented(text: str, separator: str = "") -> list[str]:
 
 
 def separator_of(line: str) -> str:
-    """What most often parts the cells of a line."""
+    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent."""
     return max("\t;,|", key=line.count)
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
-    """Exact times and the named columns, (m,) float64 each with NaN where a cell is empty, of a CSV file or a ROS bag."""
+    """Read exact times and the named columns, (m,) float64 with NaN for empty cells, from a CSV file or a ROS bag."""
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
@@ -107,8 +107,8 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
     for place, cells in rows:
         cells = [cells[i].replace(table.decimal, ".") for i in at]
         time.append(exact_seconds(cells[0], table.time_unit, f"{place}, column {table.time}"))
-        told = zip(cells[1:], wanted[1:], strict=True)
-        values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in told])
+        named = zip(cells[1:], wanted[1:], strict=True)
+        values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in named])
     if not time:
         raise ValueError(f"{path}: the table has no row. Export it again.")
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True))
@@ -116,8 +116,8 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
 
 @contextmanager
 def _bag(path: Path) -> Iterator:
-    """The reader of a ROS 1 or 2 bag; whatever another file raises is one error."""
-    from rosbags.highlevel import AnyReader, AnyReaderError  # not at the top: half a second that few imports need
+    """The reader of a ROS 1 or 2 bag.  A file that is no bag raises a ValueError, whatever the reader raised."""
+    from rosbags.highlevel import AnyReader, AnyReaderError  # here, since it takes half a second and few need it
     from rosbags.typesys import Stores, get_typestore
 
     try:
@@ -128,13 +128,13 @@ def _bag(path: Path) -> Iterator:
 
 
 def topics_of(path: Path) -> dict[str, str]:
-    """The topics of a ROS 1 or 2 bag, and the kind of message of each, such as PoseStamped."""
+    """The topics of a ROS 1 or 2 bag, each with its message type, such as PoseStamped."""
     with _bag(path) as reader:
         return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
 
 
 def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
-    """Columns of a bag; those of other topics than that of the time are interpolated at its times."""
+    """Read columns of a bag.  Columns of other topics are interpolated at the times of the topic that `table.time` names."""
     places = {name: name.partition(":")[::2] for name in (table.time, *names)}  # topic and field
     found: dict[str, list] = {name: [] for name in places}
     stamps: dict[str, list[Decimal]] = {topic: [] for topic, _ in places.values()}
@@ -150,17 +150,17 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
                     found[name].append(received if field == "received" else _field(message, field, f"{path}: {name}"))
     time = found[table.time]
     if not time or not isinstance(time[0], Decimal):
-        raise ValueError(f"{path}: {table.time!r} is no time; name /topic:header.stamp or /topic:received.")
+        raise ValueError(f"{path}: {table.time!r} is not a time; name /topic:header.stamp or /topic:received.")
     columns = {name: np.array(found[name], np.float64) for name in names}
     for name, (topic, _) in places.items():
         if topic != places[table.time][0]:
             at, known = since(time, time[0]), since(stamps[topic], time[0])
-            columns[name] = Kinematics(known, np.tile(columns[name][:, None, None], 3)).at(at)[:, 0, 0]  # blank in a gap
+            columns[name] = Kinematics(known, np.tile(columns[name][:, None, None], 3)).at(at)[:, 0, 0]  # NaN in a gap
     return time, columns
 
 
 def _field(message: object, field: str, where: str) -> float | Decimal:
-    """A number, or a stamp, of a message: "pose.position.x", "position[0]", "header.stamp"."""
+    """A number or a time stamp in a message, such as "pose.position.x", "position[0]" or "header.stamp"."""
     for part in field.split("."):
         name, _, index = part.rstrip("]").partition("[")
         try:
@@ -174,14 +174,14 @@ def _field(message: object, field: str, where: str) -> float | Decimal:
     try:
         return float(message)
     except TypeError:
-        raise ValueError(f"{where}: this field is no number; name one inside it.") from None
+        raise ValueError(f"{where}: this field is not a number; name a number inside it.") from None
 
 
 def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """The robot's log, in the robot frame that the mapping asks for.
+    """Read the robot's log, in the robot frame that the mapping asks for.
 
-    Exact times (m,), and positions (m, k, 3) mm of the landmarks; or those (m, 1, 3) of the tool's poses, their rotations
-    (m, 3, 3), and the full angle (m,) rad between the jaws, where the robot tells that.
+    Returns exact times (m,) and the landmarks (m, k, 3) mm, None, None.  If the log has poses of the tool instead: times,
+    positions (m, 1, 3) mm, rotations (m, 3, 3), and the full angle (m,) rad between the jaws, or None if it is not logged.
     """
     robot, pose = mapping.robot, mapping.robot.pose
     path = folder / robot.file
@@ -194,7 +194,7 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
     x[np.isnan(x).any(axis=2)] = np.nan
     turn = np.array(robot.frame.rotation)
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-4 or np.linalg.det(turn) < 0:
-        raise ValueError("robot.frame.rotation: no rotation; its rows must be orthonormal and right-handed.")
+        raise ValueError("robot.frame.rotation: not a rotation; its rows must be orthonormal and right-handed.")
     x = x @ turn.T + robot.frame.translation_mm
     spread_mm = float(np.linalg.norm(np.diff(np.nanpercentile(x, [5, 95], axis=0), axis=0), axis=2).max())
     if not 0.05 <= spread_mm <= 2000:
@@ -219,7 +219,7 @@ def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:
 
 
 def _rotations(path: Path, pose: Pose, values: np.ndarray) -> np.ndarray:
-    """(m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty."""
+    """Rotations (m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty."""
     kind, known = pose.rotation_kind, np.isfinite(values).all(axis=1)
     v, R = values[known], np.full((len(values), 3, 3), np.nan)
     if kind == "matrix":

@@ -1,4 +1,4 @@
-"""The mapping file of an import: what lies where in the source, in which units, under which names."""
+"""The mapping file of an import: where the data are in the source, in which units and under which names."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,17 +11,17 @@ from lib.recordings.tables import read_toml
 Vector = tuple[float, float, float]
 Columns = tuple[str, str, str]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
-Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # it goes into pages and terminals
+Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # because it is shown in web pages and terminals
 
 
 class _Section(BaseModel):
-    """Pydantic calls `model_post_init`, where a section has one, to refuse keys that do not go together."""
+    """A section of the file.  Pydantic calls its `model_post_init`, if any, which refuses keys that contradict each other."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Table(_Section):
-    """A CSV file, or a ROS bag, and its column of times.  A bag's columns are called "/topic:field.of.the.message"."""
+    """A CSV file or a ROS bag, and its column of times.  Columns of a bag are named "/topic:field.of.the.message"."""
 
     file: str
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
@@ -31,7 +31,7 @@ class Table(_Section):
 
 
 class Video(_Section):
-    """Where the frames are.  `left`, `right` are two videos or two patterns of image files; `file` holds both views."""
+    """The frames.  `left` and `right` are two videos or two patterns of image files; `file` holds both views."""
 
     layout: Literal["two", "side_by_side", "top_bottom"]
     left: str = ""
@@ -44,7 +44,7 @@ class Video(_Section):
     fps: Annotated[float, Field(gt=0)] | None = None
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
     every: Annotated[int, Field(ge=1)] = 1
-    start_s: float | None = None  # after the first frame
+    start_s: float | None = None  # `start_s`, `end_s` count from the first frame
     end_s: float | None = None
     format: Literal["jpg", "png"] = "jpg"
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95
@@ -56,7 +56,7 @@ class Video(_Section):
 
 
 class Pose(_Section):
-    """Columns of a robot that reports where its tool is and how far it opens, but no landmarks."""
+    """Columns of a robot that reports the pose of its tool and the opening of the jaws, but no landmarks."""
 
     position: Columns
     rotation: Annotated[tuple[str, ...], Field(min_length=3, max_length=9)]
@@ -71,14 +71,14 @@ class Pose(_Section):
 
 
 class Frame(_Section):
-    """robot_from_log, where the log is in another frame: rows of the rotation, and the translation in mm."""
+    """robot_from_log, if the log is in another frame than the robot's: rows of the rotation, and the translation in mm."""
 
     rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     translation_mm: Vector = (0.0, 0.0, 0.0)
 
 
 class Robot(Table):
-    """The robot's log: `landmarks` names three columns for each landmark, or `pose` those of the tool."""
+    """The robot's log: `landmarks` names three columns for each landmark, or `pose` names the columns of the tool's pose."""
 
     length_unit: Literal["m", "cm", "mm", "um"]
     landmarks: dict[Name, Columns] | None = None
@@ -89,11 +89,11 @@ class Robot(Table):
 
     def model_post_init(self, _: object) -> None:
         if (self.landmarks is None) == (self.pose is None):
-            raise ValueError("give the columns either of the landmarks or of the pose")
+            raise ValueError("give the columns of the landmarks or those of the pose, and not both")
 
 
 class Hinge(_Section):
-    """Jaws that turn by half the opening each about `axis` through `point_mm`; `jaw_mm` leads from there to closed tips."""
+    """Jaws that each turn by half the opening about `axis` through `point_mm`; `jaw_mm` leads from there to closed tips."""
 
     point_mm: Vector
     axis: Vector
@@ -105,7 +105,7 @@ class Hinge(_Section):
 
 
 class Tool(_Section):
-    """Landmarks in the tool frame: given, resting in one point for some seconds of the log, on a hinge, or estimated."""
+    """Landmarks in the tool frame: given, found from a pivot motion (the landmark rests in a point), hinged, or estimated."""
 
     landmarks_mm: dict[Name, Vector] = {}
     pivot_s: dict[Name, tuple[float, float]] = {}
@@ -116,7 +116,7 @@ class Tool(_Section):
 
 
 class Labels(_Section):
-    """Labelled landmarks: one file for both cameras, or one each; `names` gives theirs for each of ours."""
+    """Labelled landmarks: one file for both cameras, or one each; `names` maps our landmarks to the file's names."""
 
     kind: Literal["coco", "cvat", "label_studio", "deeplabcut", "sleap"]
     file: str = ""
@@ -133,7 +133,7 @@ class Labels(_Section):
 
 
 class Mapping(_Section):
-    """The whole file."""
+    """The whole mapping file."""
 
     name: Text
     description: Text = ""
@@ -157,7 +157,7 @@ class Mapping(_Section):
 
 
 def read_mapping(path: str | Path) -> Mapping:
-    """Read and check a mapping file; errors name the file, the key, what it says and what it may say."""
+    """Read and check a mapping file; errors name the file, the key, its value and what is allowed."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; `python3 -m lib import SOURCE --guess --map {path.name}` writes one.")
@@ -165,7 +165,7 @@ def read_mapping(path: str | Path) -> Mapping:
         return Mapping.model_validate(read_toml(path))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        key, told = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
-        value = f" = {told}" if len(told) < 60 and first["type"] != "missing" else ""
+        key, text = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
+        value = f" = {text}" if len(text) < 60 and first["type"] != "missing" else ""
         text = first["msg"].removeprefix("Value error, ").removesuffix(".")
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None

@@ -1,4 +1,4 @@
-"""Stereo frames from videos of any codec and from image files, as 8-bit RGB with the true time of each."""
+"""Reads stereo frames from videos of any codec and from image files, as 8-bit RGB with the true time of each."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -17,13 +17,13 @@ from lib.recordings import read_image, to_8_bits
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
-_STEP_S = 1e-4, 60.0  # of frames; beyond it the unit of time is another
-_DEPTH_SAMPLES = 12
-_DECIMAL = re.compile(r"(?<![\d.])(\d+\.|\d{10}[_-])(\d{1,9})$")  # more digits after the point are a time of their own
+_STEP_S = 1e-4, 60.0  # plausible median step of frames; outside this range the unit of time must be wrong
+_DEPTH_SAMPLES = 12  # number of frames in which the brightest value is searched
+_DECIMAL = re.compile(r"(?<![\d.])(\d+\.|\d{10}[_-])(\d{1,9})$")  # over 9 digits after a point are a time themselves
 
 
 def last_number(path: str | PurePath) -> int | None:
-    """The last whole number in a file's name, which numbers or dates it.
+    """The last whole number in a file's name, which is its frame number or its time.
 
     >>> last_number("cam0/frame_000012.png")
     12
@@ -33,7 +33,7 @@ def last_number(path: str | PurePath) -> int | None:
 
 
 def decimals(files: Sequence[Path]) -> list[Decimal]:
-    """The numbers at the end of the files' names where they have a decimal point, as seconds in dumps of ROS; else none.
+    """The decimal numbers at the end of the files' names, which are seconds in dumps of ROS; empty if there are none.
 
     >>> decimals([Path("cam0/1700000000.250000.png"), Path("cam0/1700000000_500000.png")])
     [Decimal('1700000000.250000'), Decimal('1700000000.500000')]
@@ -41,8 +41,8 @@ def decimals(files: Sequence[Path]) -> list[Decimal]:
     found = [_DECIMAL.search(path.stem) for path in files]
     digits, whole = {m and len(m[2]) for m in found}, {int(m[1][:-1]) for m in found if m}
     if len(digits) > 1 and len(whole) < 2 and max(whole, default=0) < 10**9:
-        return []  # as in v1.9, v1.10
-    if len(digits) > 1:  # .5 may be half a second, or 5 ns
+        return []  # versions or counters, as in v1.9, v1.10
+    if len(digits) > 1:  # .5 may be half a second or 5 ns
         what = f"some names end on a decimal number, but not all, or not with as many digits ({len(digits)} kinds)"
         raise ValueError(f"{files[0].parent}: {what}. Number the files 000000, 000001, ..., and give their times in a table.")
     return [Decimal(f"{m[1][:-1]}.{m[2]}") for m in found if m]
@@ -53,17 +53,17 @@ class _Images:
 
     def __init__(self, folder: Path, pattern: str) -> None:
         if Path(pattern).is_absolute():
-            raise ValueError(f"{pattern}: name the images by where they are in {folder}, as left/*.png.")
+            raise ValueError(f"{pattern}: name the images relative to {folder}, such as left/*.png.")
         if not (found := [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]):
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
-            raise ValueError(f"{min(bad)}: the name holds no number, so its place in time is open. Number the files.")
+            raise ValueError(f"{min(bad)}: the name holds no number, so its order is unknown. Number the files.")
         seconds = decimals(found)
         order = sorted(zip(seconds or map(last_number, found), found, strict=True))
         self.in_names, self.files = [number for number, _ in order], [path for _, path in order]
         for (one, path), (other, later) in pairwise(order):
             if one == other:
-                raise ValueError(f"{later}: numbered like {path.name}. Narrow the pattern, so that it names one camera.")
+                raise ValueError(f"{later}: has the same number as {path.name}. Narrow the pattern to one camera.")
         self.stamps = None
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
         counted &= len(set(map(int, seconds))) < 2
@@ -78,7 +78,7 @@ class _Images:
 
 
 class _Film:
-    """A video file, decoded once from its start; times are those of its container."""
+    """A video file, decoded from its start; times are those of its container."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
@@ -87,15 +87,15 @@ class _Film:
         with self._open() as container:
             stream = container.streams.video[0]
             times = [(p.pts, p.dts) for p in container.demux(stream) if p.size and not p.is_discard]
-            told, end_s = stream.frames or len(times), 0.0
-            if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states its length alone
+            stated, end_s = stream.frames or len(times), 0.0
+            if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states only its duration
                 end_s = (container.duration or 0) / av.time_base
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
-        which = int(any(pts is None for pts, _ in times))  # .avi states the order of decoding only
+        which = int(any(pts is None for pts, _ in times))  # .avi has only times of decoding (dts)
         self.stamps = [Decimal(t) * base for t in sorted(pair[which] for pair in times if pair[which] is not None)]
         step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
-        if len(self.stamps) != told or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
-            raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {told} ({end_s:.1f} s). Copy it again.")
+        if len(self.stamps) != stated or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
+            raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {stated} ({end_s:.1f} s). Copy it again.")
 
     def _open(self) -> av.container.InputContainer:
         try:
@@ -105,7 +105,7 @@ class _Film:
             raise ValueError(f"{self.path}: the video cannot be opened ({error}). {cure}.") from None
         if not container.streams.video or container.streams.video[0].codec_context is None:
             container.close()
-            raise ValueError(f"{self.path}: no video of a known codec in it. Convert it to H.264 in an .mp4 file.")
+            raise ValueError(f"{self.path}: no video of a known codec. Convert it to H.264 in an .mp4 file.")
         return container
 
     def __len__(self) -> int:
@@ -125,20 +125,20 @@ class _Film:
                     raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
                 if index in wanted:
                     deep = max(c.bits for c in frame.format.components) == 16
-                    # Of 16 bits a camera may use 12; fewer bits the format itself states, and they are scaled by it.
+                    # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
                     yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
 
 
 @dataclass(frozen=True, eq=False)
 class StereoSource:
-    """Pairs of frames: which frame of each source makes a pair (n, 2), and the exact times of the pairs."""
+    """Pairs of frames, with the exact time of each."""
 
-    reels: tuple[_Images | _Film, ...]  # left and right, or the one that holds both views
+    reels: tuple[_Images | _Film, ...]  # left and right, or one that holds both views
     video: Video
-    index: np.ndarray
+    index: np.ndarray  # (n, 2) left and right frame of each pair
     time: list[Decimal]
-    bit_depth: int | None  # what the brightest value of 16-bit frames is scaled by; None for 8-bit frames
-    dropped: int  # frames that have no partner
+    bit_depth: int | None  # bits used by 16-bit frames, which are scaled to 8; None for 8-bit frames
+    dropped: int  # number of frames that have no partner
 
     def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Left and right images, (h, w, 3) uint8 RGB."""
@@ -149,7 +149,7 @@ class StereoSource:
             if self.video.layout != "two":
                 axis = 1 if self.video.layout == "side_by_side" else 0
                 if images[0].shape[axis] % 2:
-                    raise ValueError(f"{file}: {sizes[0]} have no two halves. Check layout.")
+                    raise ValueError(f"{file}: images of {sizes[0]} do not split into equal halves. Check layout.")
                 images = np.split(images[0], 2, axis=axis)
             left, right = images[::-1] if self.video.exchanged else images
             if left.shape != right.shape:
@@ -158,7 +158,7 @@ class StereoSource:
 
 
 def open_stereo(folder: Path, video: Video) -> StereoSource:
-    """Open the frames that a mapping describes; images are decoded when asked for."""
+    """Open the frames that a mapping describes; images are decoded when they are read."""
     names = [video.left, video.right] if video.layout == "two" else [video.file]
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
@@ -175,11 +175,11 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
-    """Numbers from 0 of the frames: a gap in the numbers of images is a frame that is missing, if all steps tell that."""
+    """Frame numbers from 0 in each source, with gaps if all steps of the images' numbers are multiples of the usual step."""
     steps = [np.diff([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
     usual = max(np.median(np.concatenate(steps)) if any(map(len, steps)) else 1, 1)
-    told = all(len(own) + 1 == len(reel) and not (own % usual).any() for own, reel in zip(steps, reels, strict=True))
-    return [np.cumsum([0, *own // usual]) if told else np.arange(len(reel)) for own, reel in zip(steps, reels, strict=True)]
+    even = all(len(own) + 1 == len(reel) and not (own % usual).any() for own, reel in zip(steps, reels, strict=True))
+    return [np.cumsum([0, *own // usual]) if even else np.arange(len(reel)) for own, reel in zip(steps, reels, strict=True)]
 
 
 def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:
@@ -193,12 +193,12 @@ def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray
             raise ValueError(f"{folder / video.table.file}: {len(time)} times for {len(reel)} frames of {reel.files[0]}.")
         return time
     if reel.stamps is None or video.times == "names":
-        raise ValueError(f"{reel.files[0]}: it carries no such times; set video.times to fps, table, names or container.")
+        raise ValueError(f"{reel.files[0]}: has no times of this kind; set video.times to fps, table, names or container.")
     return reel.stamps
 
 
 def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
-    """(n, 2) frames of both sources that lie nearest in time, at most half a frame apart."""
+    """(n, 2) left and right frames that are nearest in time, less than half a frame apart."""
     if len(times) == 1:
         return np.repeat(np.arange(len(times[0]))[:, None], 2, axis=1)
     left, right = (since(time, times[0][0]) for time in times)
@@ -213,12 +213,12 @@ def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
 
 
 def _bit_depth(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> int | None:
-    """The least of 8, 10, 12, 14, 16 bits that holds the brightest value of some 16-bit frames; None for 8-bit frames."""
+    """The fewest of 8, 10, 12, 14, 16 bits that hold the brightest value of sampled 16-bit frames; None if all are 8-bit."""
     some = index[np.unique(np.linspace(0, len(index) - 1, _DEPTH_SAMPLES).astype(int))]
     brightest = 0
     for reel, wanted in zip(reels, some.T, strict=False):
         if isinstance(reel, _Film):
-            wanted = wanted[: max(1, len(wanted) // 4)]  # a video is decoded up to there
+            wanted = wanted[: max(1, len(wanted) // 4)]  # since a video is decoded from its start
         for image in reel.read(wanted):
             if image.dtype == np.uint8:
                 break  # the other camera may have 16

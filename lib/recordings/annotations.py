@@ -11,7 +11,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
 SIDES = ("left", "right")
-#: Standard deviation of a label set by hand, along each axis.
+#: Standard deviation of a label set by hand, in each coordinate.
 CLICK_SD_PX = 1.5
 
 
@@ -21,7 +21,7 @@ class Annotations:
 
     Attributes:
         u_left, u_right: (n, k, 2) px, NaN where not labelled.
-        visibility_left, visibility_right: (n, k) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible; and -1
+        visibility_left, visibility_right: (n, k) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible; also -1
             for a landmark that the image does not show.  None = 2 wherever there is a label.
     """
 
@@ -42,14 +42,14 @@ class Annotations:
 
 
 def inside(u: np.ndarray, image_size_px: tuple[int, int]) -> np.ndarray:
-    """Which pixels (..., 2) lie in an image of (width, height); NaN does not."""
+    """True for pixels (..., 2) that lie in an image of (width, height); False for NaN."""
     return ((u >= -0.5) & (u <= np.subtract(image_size_px, 0.5))).all(axis=-1)
 
 
 def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
-    """The image, the names (k,) and x, y, visibility (k, 3) of each annotation in a file of COCO keypoints.
+    """Yield image, names (k,) and x, y, visibility (k, 3) of each annotation in a file of COCO keypoints.
 
-    COCO has no word for a landmark that an image does not show: an entry's own list ``absent`` names those of visibility -1.
+    COCO cannot state that an image does not show a landmark.  Our own key ``absent`` lists such landmarks (visibility -1).
     """
     try:
         content = json.loads(path.read_bytes())
@@ -77,7 +77,7 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
 def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmarks: Sequence[str] = LANDMARKS) -> Annotations:
     """Read COCO keypoints whose image names are ``left/000012.jpg`` and the like.
 
-    The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
+    The category's names state the order of the keypoints, which may be any; keypoints of other names are ignored.
     """
     u = np.full((2, n_frames, len(landmarks), 2), np.nan)
     visibility = np.zeros((2, n_frames, len(landmarks)), dtype=np.int64)
@@ -103,7 +103,7 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
 def write_coco(
     path: Path, annotations: Annotations, image_size_px: tuple[int, int], suffix: str, landmarks: Sequence[str] = LANDMARKS
 ) -> None:
-    """Write `annotations`; points that are NaN or outside the image are written as not labelled."""
+    """Write annotations as COCO keypoints; points that are NaN or outside the image are written as not labelled."""
     content = _empty(landmarks)
     images, entries = content["images"], content["annotations"]
     for side in SIDES:
@@ -118,9 +118,9 @@ def write_coco(
 
 
 def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks: Sequence[str], values: np.ndarray) -> None:
-    """Set the landmarks of one image, x, y, visibility (k, 3), in a file of COCO keypoints, new where there is none.
+    """Set x, y, visibility (k, 3) of the landmarks in one image, in a file of COCO keypoints, which is made if missing.
 
-    All else in the file stays: other images, other keypoints, keys that are not ours.
+    All else in the file stays: other images, other keypoints, other keys.
     """
     content = json.loads(path.read_bytes()) if path.exists() else _empty(landmarks)
     images, entries = content["images"], content["annotations"]
@@ -141,7 +141,7 @@ def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks:
 
 
 def _place(file_name: str) -> tuple[str | int, ...]:
-    """Folder and number of an image: left/3.png and left/000003.jpg are the same."""
+    """Folder and number of an image, so that left/3.png and left/000003.jpg are the same image."""
     *folder, stem = PurePosixPath(file_name).with_suffix("").parts[-2:]
     return (*folder, int(stem) if stem.isdecimal() else stem)
 
@@ -158,7 +158,7 @@ def _image(identity: int, file_name: str, image_size_px: tuple[int, int]) -> dic
 
 
 def _filled(entry: dict, names: Sequence[str], landmarks: Sequence[str], values: np.ndarray) -> dict:
-    """The entry of an image with x, y, visibility (k, 3) of `landmarks` in it; `names` are those of its keypoints."""
+    """An image's entry with x, y, visibility (k, 3) of `landmarks` filled in; `names` are those of all its keypoints."""
     table = np.reshape(entry.get("keypoints", np.zeros(3 * len(names))), (-1, 3)).astype(np.float64)
     table[[names.index(name) for name in landmarks]] = np.where(values[:, 2:] > 0, values, 0.0)
     shown = table[table[:, 2] > 0, :2]

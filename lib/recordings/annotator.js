@@ -1,23 +1,23 @@
 // The annotator's page: two views of a stereo frame, marks, suggestions, epipolar lines.  lib/recordings/annotator.py keeps
-// what is marked; this file draws and asks.  Pixels are (x, y) with integers at pixel centres, so pixel (x, y) covers
+// the marks; this file draws them and sends it messages.  Pixels are (x, y) with integers at pixel centres, so pixel (x, y) covers
 // [x - 0.5, x + 0.5]; a view shows image corner coordinates X = x + 0.5 at screen (X - view.x) * view.zoom, in CSS pixels.
 
 const COLOURS = ["#56b4e9", "#ffb000", "#2bd4a0", "#f78ad0", "#f0e442", "#ff7f5e", "#b79cff", "#ffffff"];
 const SIDES = ["left", "right"];
 const LOUPE = { radius: 78, times: 4, least: 8 };
 const SILENT_MS = 4000;
-const FARTHEST_CLICK = 4; // a press that moves farther drags
+const FARTHEST_CLICK = 4; // CSS pixels; a press that moves farther is a drag
 
 const KEYS = [
   ["click, Enter", "mark the current landmark"],
   ["1 ... 8", "choose a landmark"],
   ["v", "other view"],
   ["arrows", "move the cursor by a screen pixel (Shift: by 20)"],
-  ["a", "accept the robot's place (Shift: all that are open)"],
-  ["d", "accept the detector's place (Shift: all that are open)"],
+  ["a", "mark where the robot reports it (Shift: all without a mark)"],
+  ["d", "mark where the detector found it (Shift: all without a mark)"],
   ["h", "hidden, or visible again"],
   ["x", "not in this image"],
-  ["Delete", "take the mark away"],
+  ["Delete", "remove the mark"],
   ["u, r", "undo, redo"],
   ["n", "next frame, the most useful first"],
   [", .", "frame before, frame after"],
@@ -101,7 +101,7 @@ function render({ model, el }) {
   help.hidden = true;
   for (const [key, text] of KEYS) element("kbd", "", element("div", "", help)).after(text), (help.lastChild.firstChild.textContent = key);
 
-  let about = null, shown = null; // what the recording is; the frame that is shown, as the kernel told it
+  let about = null, shown = null; // description of the recording; state of the frame that is shown, from the kernel
   let active = 0, landmark = 0, loupe = true, suggestions = true, contrast = 1, brightness = 1, wanted = null;
   let waiting = new Map(), count = 0, problem = "";
   const views = SIDES.map((side, index) => {
@@ -113,7 +113,7 @@ function render({ model, el }) {
     return view;
   });
 
-  // --- messages: what was marked stays in the browser's store until the kernel says that it is in the file
+  // --- messages: marks stay in the browser's store until the kernel confirms that they are in the file
 
   const me = Math.random().toString(36).slice(2); // several pages may show one recording, in one kernel or in several
   const store = (page) => `microstereo.annotator:${about.key}|${page}`;
@@ -121,7 +121,7 @@ function render({ model, el }) {
     const marks = [...waiting.values()].filter((m) => m.do === "mark").map((m) => m.marks);
     try { marks.length ? localStorage.setItem(store(me), JSON.stringify(marks)) : localStorage.removeItem(store(me)); } catch { /* no store */ }
   }
-  function takeOver() { // what pages before this one could not save
+  function takeOver() { // send the marks that earlier pages could not save
     try {
       for (const name of Object.keys(localStorage).filter((name) => name.startsWith(store("")))) {
         for (const marks of JSON.parse(localStorage.getItem(name))) ask({ do: "mark", marks, frame: marks[0][1] });
@@ -133,7 +133,7 @@ function render({ model, el }) {
     const sent = { ...message, id: `${me}.${++count}`, since: Date.now() };
     waiting.set(sent.id, sent);
     if (sent.do === "mark") keep();
-    try { model.send(sent); } catch { /* told below, when no answer comes */ }
+    try { model.send(sent); } catch { /* tell() reports it if no answer comes */ }
     tell();
   }
   function tell() {
@@ -146,7 +146,7 @@ function render({ model, el }) {
   }
   async function hear(answer, buffers) {
     if (answer.renew) return shown && ask({ do: "show", frame: shown.frame });
-    if (!waiting.has(answer.id)) { // another page of the same annotator asked; what it changed holds here too
+    if (!waiting.has(answer.id)) { // the answer to another page of the same annotator, whose changes hold here too
       if (!shown || !answer.complete || waiting.size) return;
       shown = answer.frame === shown.frame ? { ...shown, ...answer } : { ...shown, complete: answer.complete };
       return draw();
@@ -155,7 +155,7 @@ function render({ model, el }) {
     waiting.delete(answer.id);
     const writes = ["mark", "undo", "redo"].includes(asked.do);
     if (answer.error) problem = (writes ? "Not saved: " : "") + answer.error;
-    else if (writes || !problem.startsWith("Not saved")) problem = ""; // what follows a refused mark does not hide it
+    else if (writes || !problem.startsWith("Not saved")) problem = ""; // later answers must not hide a refused mark
     if (asked.do === "hello" && answer.landmarks) {
       about = answer;
       takeOver();
@@ -183,7 +183,7 @@ function render({ model, el }) {
 
   // --- marks
 
-  /** The first landmark without a mark in a view; the current one where there is none. */
+  /** The first landmark without a mark in a view, or the current one if all have marks. */
   function open(index) {
     const free = shown.marks[index].findIndex((mark) => mark[2] === 0);
     return free < 0 ? landmark : free;
@@ -198,7 +198,7 @@ function render({ model, el }) {
     ask({ do: "mark", marks, frame: shown.frame });
     draw();
   }
-  function choose(index, k) { // the keyboard's cursor goes to where the landmark is, or is suggested
+  function choose(index, k) { // the keyboard's cursor moves to the landmark's mark or suggestion
     [active, landmark] = [index, k];
     if ([shown.marks, shown.robot, shown.detector].some((u) => u[index][k][0] !== null)) views[index].cursor = null;
     draw();
@@ -293,7 +293,7 @@ function render({ model, el }) {
   }
   function paintImage(view) {
     const r = view.box.getBoundingClientRect(), scale = window.devicePixelRatio, ratio = Number.isInteger(scale) ? 1 : scale;
-    for (const canvas of [view.picture, view.overlay]) { // a browser draws from whole pixels, wherever the box begins
+    for (const canvas of [view.picture, view.overlay]) { // browsers draw from whole pixels, so the canvases start there
       canvas.style.left = `${Math.round(r.left * ratio) / ratio - r.left}px`;
       canvas.style.top = `${Math.round(r.top * ratio) / ratio - r.top}px`;
     }
@@ -303,7 +303,7 @@ function render({ model, el }) {
     c.imageSmoothingQuality = "high";
     c.drawImage(view.image, -view.x * view.zoom, -view.y * view.zoom, about.size[0] * view.zoom, about.size[1] * view.zoom);
   }
-  function stroke(c, colour, width, dash = []) { // a dark seam keeps every colour readable on every picture
+  function stroke(c, colour, width, dash = []) { // a dark outline keeps every colour readable on every image
     c.setLineDash(dash);
     for (const [style, wide] of [["#0008", width + 1.6], [colour, width]]) { c.strokeStyle = style; c.lineWidth = wide; c.stroke(); }
   }
@@ -428,7 +428,7 @@ function render({ model, el }) {
     if (event.altKey || (command && event.key.toLowerCase() !== "z") || pressed) return;
     views.forEach((view) => { view.at = null; });
     const used = command ? press(event.shiftKey ? "r" : "u", false) : press(event.key, event.shiftKey);
-    const typed = !command && event.key.length === 1; // else the notebook would take it for one of its own: m, y, i i, ...
+    const typed = !command && event.key.length === 1; // else the notebook would take it as a shortcut: m, y, i i, ...
     if (used || typed) { event.preventDefault(); event.stopPropagation(); }
   });
   root.addEventListener("focus", draw);

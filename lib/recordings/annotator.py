@@ -1,6 +1,6 @@
-"""The annotator: a person marks landmarks in both views, in JupyterLab, and each mark is in annotations.json at once.
+"""The annotator: a person marks landmarks in both views, in JupyterLab, and each mark is saved to annotations.json at once.
 
-`Annotator` holds what is marked and suggested and answers the messages of its page, annotator.js, which draws.
+`Annotator` holds marks and suggestions and answers the messages of its page, annotator.js, which draws them.
 """
 
 from functools import cached_property
@@ -14,19 +14,19 @@ from lib.recordings.annotations import SIDES, inside, mark_coco, read_coco
 from lib.recordings.frames import encoded
 from lib.recordings.recording import Recording
 
-#: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
+#: Depths in mm from the tool along a viewing ray, whose projections make the epipolar line.  A depth of field is 3 mm.
 _DEPTHS_MM = np.linspace(-20.0, 20.0, 9)
 
 
 class Annotator:
-    """Labels for a recording, set by hand: displayed in JupyterLab, a page with both views (press ? there for its keys).
+    """Sets labels by hand.  Displayed in JupyterLab, it is a page with both views; press ? there for the list of its keys.
 
-    Each change is written whole to annotations.json before the page shows it as saved, and leaves all else in the file as
-    it is; so a killed kernel loses nothing.
+    Each change is written to annotations.json before the page shows it as saved, so a killed kernel loses nothing.  All
+    else in the file stays as it is.
 
     Args:
         rig: Cameras, if known.  They give the epipolar lines of left marks, and the robot's landmarks as suggestions.
-        detected: What the detector found (`lib.landmarks.detect`), with the robot's position of each landmark.  Both are
+        detected: Detections (`lib.landmarks.detect`), with the robot's position of each landmark.  Both are shown as
             suggestions, and frames in which they disagree most come first.
 
     >>> import shutil, tempfile
@@ -46,7 +46,7 @@ class Annotator:
         self.know(rig=rig, detected=detected)
 
     def know(self, *, rig: StereoRig | None = None, detected: Correspondences | None = None) -> None:
-        """Take a rig and detections that came later; an open page shows them at once."""
+        """Set the rig and the detections; an open page shows them at once."""
         n, k = len(self.recording), len(self.recording.skeleton)
         nothing = np.full((2, n, k, 2), np.nan)
         detector, self._rig, self._x_mm = nothing.copy(), rig, self.recording.landmarks_mm()
@@ -55,13 +55,13 @@ class Annotator:
             detector[:, rows.frame, rows.landmark] = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
         robot = nothing if rig is None else np.reshape(rig.project(self._x_mm.reshape(-1, 3)), nothing.shape)
         self._suggested = {"robot": robot, "detector": detector}
-        # (n,) px: the farthest that both are apart in a frame; the tool's length where the detector did not find a landmark.
-        off = np.linalg.norm(robot - detector, axis=-1)
+        # (n,) px: the largest distance between robot and detector in a frame; a missed landmark counts as the tool's length.
+        distance = np.linalg.norm(robot - detector, axis=-1)
         length = np.linalg.norm(robot[:, :, 1:] - robot[:, :, :1], axis=-1)
         length = np.nanmedian(length) if np.isfinite(length).any() else 0.0
         missed = inside(robot, self.recording.image_size_px) & ~np.isfinite(detector).all(axis=-1)
         looked = detected is not None and np.isin(np.arange(n), detected.frame)
-        self.usefulness = np.where(looked, np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2)), 0.0)
+        self.usefulness = np.where(looked, np.where(missed, length, np.nan_to_num(distance)).max(axis=(0, 2)), 0.0)
         if "widget" in vars(self):
             self.widget.send({"renew": True})
 
@@ -82,15 +82,15 @@ class Annotator:
         self._change([(side, frame, self.recording.skeleton.index(landmark), *(u or (np.nan, np.nan)), visibility)])
 
     def undo(self) -> int | None:
-        """Take the last change back; returns its frame, None where there is none."""
+        """Undo the last change; returns its frame, or None if there is none."""
         return self._replay(self._done, self._undone)
 
     def redo(self) -> int | None:
-        """Make the change again that was taken back last."""
+        """Repeat the change that was undone last; returns its frame, or None if there is none."""
         return self._replay(self._undone, self._done)
 
     def next_frame(self, frame: int) -> int:
-        """The most useful frame that is not labelled, of those not yet visited; of equal ones the farthest from any label."""
+        """The most useful frame that is neither labelled nor visited; of equal ones, the farthest from labels and `frame`."""
         self._visited.add(frame)
         left = set(np.flatnonzero(~self.complete).tolist())
         if left <= self._visited:
@@ -103,7 +103,7 @@ class Annotator:
         return int(fresh[np.lexsort((gap, np.nan_to_num(self.usefulness[fresh])))[-1]])
 
     def _read(self) -> None:
-        """Take the marks, x, y, visibility (2, n, k, 3) of the left and the right view, from the file."""
+        """Read the marks from the file: x, y, visibility (2, n, k, 3) in the left and the right view."""
         r = self.recording
         self._marks = np.tile([np.nan, np.nan, 0.0], (2, len(r), len(r.skeleton), 1))
         if self._path.exists():
@@ -112,7 +112,7 @@ class Annotator:
             self._marks[..., 2] = found.visibility_left, found.visibility_right
 
     def _change(self, changes: list[tuple]) -> None:
-        """Write changes (side, frame, number of the landmark, x, y, visibility) as one step that `undo` takes back."""
+        """Write changes (side, frame, number of the landmark, x, y, visibility) as one step for `undo`."""
         self._done.append(self._write(changes))
         self._undone.clear()
 
@@ -123,14 +123,14 @@ class Annotator:
         return taken.pop()[0][1]
 
     def _write(self, changes: list[tuple]) -> list[tuple]:
-        """Write changes to the file and return those that take them back."""
+        """Write changes to the file and return the changes that undo them."""
         r, n = self.recording, len(self.recording)
         for side, frame, landmark, x, y, v in changes:
             if side not in SIDES or not 0 <= frame < n or not 0 <= landmark < len(r.skeleton) or v not in (-1, 0, 1, 2):
-                raise ValueError(f"mark: {side!r}, frame {frame}, landmark {landmark}, visibility {v}: no such thing here.")
+                raise ValueError(f"mark: {side!r}, frame {frame}, landmark {landmark}, visibility {v}: does not exist here.")
             if v > 0 and not inside(np.array([x, y], np.float64), r.image_size_px):
                 raise ValueError(f"u: ({x}, {y}) lies outside the image of {r.image_size_px[0]} x {r.image_size_px[1]} px.")
-        self._read()  # what another program wrote meanwhile stays
+        self._read()  # keeps what another program wrote meanwhile
         images = {(side, frame): self._marks[SIDES.index(side), frame].copy() for side, frame, *_ in changes}
         before = [(side, frame, k, *images[side, frame][k]) for side, frame, k, *_ in changes]
         for side, frame, k, x, y, v in changes:
@@ -145,7 +145,7 @@ class Annotator:
     @cached_property
     def widget(self) -> object:
         """The page as an `anywidget`; displaying the annotator displays it."""
-        import anywidget  # late: whoever only reads recordings needs no Jupyter
+        import anywidget  # imported here, since reading recordings needs no Jupyter
 
         class Page(anywidget.AnyWidget):
             _esm = Path(__file__).with_name("annotator.js").read_text(encoding="utf-8")
@@ -158,7 +158,7 @@ class Annotator:
         return self.widget._repr_mimebundle_(**options)
 
     def handle(self, message: dict) -> tuple[dict, list[bytes]]:
-        """The answer to a message of the page, and images as JPEG: hello, show, next, mark, undo, redo."""
+        """Answer a message of the page (hello, show, next, mark, undo or redo); returns the answer and images as JPEG."""
         todo, frame, images = message["do"], int(message.get("frame") or 0), []
         answer = {"id": message.get("id")}
         moves = {"next": lambda: self.next_frame(frame), "undo": self.undo, "redo": self.redo}
@@ -182,14 +182,14 @@ class Annotator:
         return answer, images
 
     def _state(self, frame: int) -> dict:
-        """What the page shows of a frame: marks, suggestions, epipolar lines, and how much is labelled."""
-        told = {"frame": frame, "marks": _plain(self._marks[:, frame]), "usefulness": float(self.usefulness[frame])}
-        told |= {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
-        told["lines"] = [self._epipolar_line(u) if v > 0 else None for *u, v in self._marks[0, frame]]
-        return told | {"complete": self.complete.tolist(), "file": self._path.name}
+        """The state that the page shows: a frame's marks, suggestions and epipolar lines, and which frames are labelled."""
+        state = {"frame": frame, "marks": _plain(self._marks[:, frame]), "usefulness": float(self.usefulness[frame])}
+        state |= {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
+        state["lines"] = [self._epipolar_line(u) if v > 0 else None for *u, v in self._marks[0, frame]]
+        return state | {"complete": self.complete.tolist(), "file": self._path.name}
 
     def _epipolar_line(self, u_left: np.ndarray) -> list | None:
-        """Right pixels of points on the viewing ray of a left pixel."""
+        """Right pixels of points on the viewing ray of a left pixel, or None without cameras."""
         if self._rig is None:
             return None
         left, near = self._rig.left, self._x_mm[np.isfinite(self._x_mm).all(axis=-1)]
@@ -200,5 +200,5 @@ class Annotator:
 
 
 def _plain(values: np.ndarray) -> list:
-    """Nested lists with None for NaN."""
+    """An array as nested lists with None for NaN, as JSON needs it."""
     return np.where(np.isfinite(values), values.astype(object), None).tolist()

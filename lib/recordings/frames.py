@@ -1,4 +1,4 @@
-"""The stereo frames of a recording: folders of images or two videos, decoded when asked for."""
+"""The stereo frames of a recording: folders of images or two videos, decoded when a frame is read."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
-#: Decodes a frame by its number.
+#: Decodes the frame with a given number.
 Reader = Callable[[int], np.ndarray]
-_LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
+_LOST_BYTES = 512  # length of a disk sector, which a crash or a bad copy may replace by zeros
 
 
 @dataclass(frozen=True)
@@ -27,19 +27,19 @@ class StereoFrame:
 
 
 def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int | None = 0) -> np.ndarray:
-    """An image file, colour or grey, as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
+    """Read an image file, colour or grey, as (h, w, 3) uint8 RGB.  An EXIF orientation is ignored.
 
     Args:
-        image_size_px: (width, height) that it must have.
-        bit_depth: Of frames of 16 bits, as in `to_8_bits`; None leaves them as uint16.
+        image_size_px: Required (width, height).
+        bit_depth: Number of bits that a 16-bit image uses, as in `to_8_bits`; None returns uint16.
 
-    A ValueError if it cannot be decoded, a part of it is lost, or its size is another.
+    Raises a ValueError if the image cannot be decoded, if a part of it is lost, or if it has another size.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
     data = path.read_bytes()  # not cv2.imread: it fails on non-ASCII paths on some systems
     if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
-        raise ValueError(f"{path}: the image is corrupt; a block of zeros stands in its middle. Export it again.")
+        raise ValueError(f"{path}: the image is corrupt; a block of zeros replaces a part of it. Export it again.")
     try:
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
@@ -52,7 +52,7 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
 
 
 def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarray:
-    """An image (h, w, 3) as uint8: the `bit_depth` bits that a 16-bit image uses become 0 to 255.
+    """Scale an image (h, w, 3) to uint8: the range of the `bit_depth` bits that a 16-bit image uses becomes 0 to 255.
 
     >>> to_8_bits(np.full((1, 1, 3), 4095, np.uint16), 12, Path("dark.png")).max()
     np.uint8(255)
@@ -62,22 +62,22 @@ def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarra
     if image.dtype != np.uint16:
         raise ValueError(f"{path}: pixels of type {image.dtype}; images of 8 or 16 bits work. Export it again.")
     if not bit_depth or image.max() >= 1 << bit_depth:
-        told = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and no bit_depth is stated"
+        why = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and no bit_depth is stated"
         cure = "State what the camera uses, such as 12: bit_depth in recording.toml, video.bit_depth in an import's mapping"
-        raise ValueError(f"{path}: 16-bit values up to {image.max()}, {told}. {cure}.")
+        raise ValueError(f"{path}: 16-bit values up to {image.max()}, {why}. {cure}.")
     return np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)[image]
 
 
 def encoded(image: np.ndarray, suffix: str, *options: int) -> bytes:
-    """The content of an image file, such as ".png", for (h, w, 3) uint8 RGB; `options` as `cv2.imencode` has them."""
+    """The bytes of an image file, such as ".png", for (h, w, 3) uint8 RGB; `options` are those of `cv2.imencode`."""
     return cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)[1].tobytes()
 
 
 def _may_hold_zeros(data: bytes) -> bool:
-    """False for a JPEG in which a long run of zeros is damage, which OpenCV decodes without complaint.
+    """False for a JPEG in which a long run of zeros must be damage; OpenCV decodes it without an error.
 
-    Zeros can be picture only if they end a block in every AC table: an encoder optimised them for a flat image.  In a
-    progressive JPEG they can be; a PNG has check sums.
+    Zeros are valid image data only if zero bits mean "end of block" in every AC table, as in tables that an encoder
+    optimised for a flat image.  In a progressive JPEG they are always valid.  PNG files have check sums.
     """
     at, ends_block = 2, []
     while data[:2] == b"\xff\xd8" and data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] not in (b"\xc2", b"\xda"):
@@ -88,17 +88,17 @@ def _may_hold_zeros(data: bytes) -> bool:
                 ends_block.append(data[table + 17] == 0)
             table += 17 + sum(data[table + 1 : table + 17])
         at = after
-    whole = bytes(_LOST_BYTES) not in data[at:]  # what precedes are tables, and metadata, which may hold zeros
+    whole = bytes(_LOST_BYTES) not in data[at:]  # before that are tables and metadata, which may hold zeros
     return whole or data[:2] != b"\xff\xd8" or data[at + 1 : at + 2] == b"\xc2" or all(ends_block)
 
 
 def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | None) -> None:
     if expected is not None and size != tuple(expected):
-        raise ValueError(f"{path}: {size[0]} x {size[1]} px, but recording.toml says image_size_px = {list(expected)}.")
+        raise ValueError(f"{path}: {size[0]} x {size[1]} px, but recording.toml states image_size_px = {list(expected)}.")
 
 
 def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth: int) -> tuple[int, Reader]:
-    """How many frames one camera ("left" or "right") of a recording has, and a function that decodes one by its number."""
+    """The number of frames of one camera ("left" or "right"), and a function that decodes the frame with a given number."""
     images, video = folder / side, folder / f"{side}.mp4"
     if images.is_dir() and video.is_file():
         raise ValueError(f"{folder}: both {side}/ and {side}.mp4; keep one.")
@@ -110,7 +110,7 @@ def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth
 
 
 def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -> tuple[int, Reader]:
-    """Images numbered from 0 without a gap; the header and the end of every file are checked at once."""
+    """Open images that are numbered from 0 without a gap; the header and the end of every file are checked here."""
     paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES), key=lambda p: p.stem.zfill(9))
     for index, path in enumerate(paths):
         if not path.stem.isdecimal():
@@ -131,7 +131,7 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
         _check_size(path, size, image_size_px)
         if orientation != 1:
             cure = "Export it upright, without the orientation"
-            raise ValueError(f"{path}: its EXIF orientation is {orientation}, so other programs turn it. {cure}.")
+            raise ValueError(f"{path}: its EXIF orientation is {orientation}, so other programs rotate it. {cure}.")
         with path.open("rb") as stream:
             stream.seek(-min(path.stat().st_size, 32), 2)
             if (b"IEND" if path.suffix.lower() == ".png" else b"\xff\xd9") not in stream.read():
@@ -140,7 +140,7 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
 
 
 def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
-    """A video file.  In order each frame is decoded once; a leap seeks, or where the rate varies decodes all on its way."""
+    """Open a video file.  Reading in order decodes each frame once; a jump seeks, or reads all between if the rate varies."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")
@@ -151,7 +151,7 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
 
     @cache
     def steady() -> bool:
-        """Whether frames come at a constant rate, since OpenCV seeks by it."""
+        """True if the frame rate is constant, which OpenCV assumes when it seeks."""
         with av.open(str(path)) as container:
             times = np.sort([packet.pts for packet in container.demux(video=0) if packet.pts is not None])
         even = np.linspace(times[0], times[-1], len(times))
@@ -165,7 +165,7 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
         while following <= index:
             ok, image = capture.read()
             if not ok:
-                raise ValueError(f"{path}: frame {following} of {count} cannot be decoded; the file is cut.")
+                raise ValueError(f"{path}: frame {following} of {count} cannot be decoded; the file is cut off.")
             following += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
@@ -173,7 +173,7 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
 
 
 class Frames(Sequence[StereoFrame]):
-    """Stereo frames at `time_s` (n,), video clock, strictly increasing; decoded when indexed, the last few kept."""
+    """Stereo frames at times `time_s` (n,), video clock, strictly increasing.  Indexing decodes; four frames are cached."""
 
     def __init__(self, left: Reader, right: Reader, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What the two cameras of a recording see behind the tool: as the tool moves, most frames show each place without it."""
+"""The ground: the image behind the tool in both cameras.  As the tool moves, most frames show each place without it."""
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -6,14 +6,14 @@ from typing import Self
 
 import numpy as np
 
-_FRAMES = 9  # so many make the ground; more take longer and show hardly more
-_FEWEST = 5  # before so many have come, most of what one shows may be the tool
+_FRAMES = 9  # number of frames in the median; more take longer and hardly improve it
+_FEWEST = 5  # with fewer frames the tool may cover a place in most of them
 
 
 class Ground:
-    """The images (2, h, w, 3) uint8 RGB that two cameras see behind the tool; made when first called, then kept.
+    """The images (2, h, w, 3) uint8 RGB behind the tool; a call returns them, and the first call computes them.
 
-    `key` names what they are made of.
+    `key` identifies the frames that they are computed from.
 
     >>> ground = Ground(lambda: np.zeros((2, 4, 6, 3), np.uint8), "dark")
     >>> ground().shape, ground.changed(lambda images: images[:, :2]).key, ground.changed(lambda images: images[:, :2])().shape
@@ -30,8 +30,8 @@ class Ground:
     def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self:
         """The median of those frames of a recording (`name`) between which the robot's tool x_mm (n, k, 3) moves farthest.
 
-        Where the robot says nothing, frames are taken evenly.  What moves all the time is blurred, and a tool that rests is
-        part of the ground: who looks there must look at the frame itself, too.
+        If the robot reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred,
+        and a tool at rest becomes part of the ground, so a detector must also search the frame itself.
         """
         chosen = apart(x_mm.mean(axis=1), _FRAMES)
 
@@ -42,12 +42,12 @@ class Ground:
         return cls(see, f"{name} {chosen.tolist()}")
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Self:
-        """The ground of images that `change` makes of the cameras' ones."""
+        """The ground of images that `change` has processed: the same change of the cameras' ground."""
         return type(self)(lambda: change(self()), self.key)
 
 
 class GrowingGround:
-    """The `ground` of frames that come one by one, as in `Ground.of_frames`; None before there are five.
+    """The `ground` of frames that arrive one by one, chosen as in `Ground.of_frames`; None until five are kept.
 
     >>> growing = GrowingGround()
     >>> for k in range(5):
@@ -62,7 +62,7 @@ class GrowingGround:
         self.ground: Ground | None = None
 
     def take(self, images: np.ndarray, x_mm: np.ndarray) -> None:
-        """A stereo frame (2, h, w, 3) uint8, copied if it is kept, and where the robot has the tool, (k, 3)."""
+        """Add a stereo frame (2, h, w, 3) uint8, which is copied if it is kept, and the robot's landmarks (k, 3) mm."""
         centre_mm, new = np.vstack([self._centre_mm, x_mm.mean(axis=0)]), len(self._kept)
         chosen = apart(centre_mm, _FRAMES)
         if new not in chosen or np.isnan(centre_mm[new]).any():
@@ -74,16 +74,16 @@ class GrowingGround:
 
 def _median(images: Sequence[np.ndarray]) -> np.ndarray:
     ranked, middle = list(images), len(images) // 2
-    for last in range(len(ranked) - 1, middle - 1, -1):  # the brightest of those up to it goes there
+    for last in range(len(ranked) - 1, middle - 1, -1):  # move the maximum of 0 to `last` to `last`
         for i in range(last):
             ranked[i : i + 2] = np.minimum(*ranked[i : i + 2]), np.maximum(*ranked[i : i + 2])
     return ranked[middle]
 
 
 def apart(x: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of the points x (n, d), in ascending order: each the farthest from those before; NaN is no point.
+    """Ascending indices of at most `count` points x (n, d), each the farthest from those chosen before; NaN is no point.
 
-    Where fewer than three are points, evenly many of all rows.
+    If fewer than three points are known, the indices are evenly spaced.
 
     >>> apart(np.array([[0.0], [1.0], [2.0], [np.nan], [9.0]]), 3)
     array([0, 2, 4])

@@ -1,4 +1,4 @@
-"""Recordings read and written: everything is validated at opening, frames are decoded when asked for."""
+"""Reads and writes recordings.  Opening one validates all but the pixels, which are decoded when a frame is read."""
 
 import contextlib
 import filecmp
@@ -32,17 +32,17 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
-_GAP_S = 0.5  # in a step between samples that is longer than this and than five usual ones, nothing is interpolated
-_FARTHEST_MM = 1e5  # a position farther from the origin is no millimetre
-_ORDER = "time_s must be a number larger than the row before"
-_LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
-_COVERED = 0.75  # share of frames with a position, below which log and video do not fit
-_JUMP_MM = 20.0  # from one sample to the next; no surgical robot moves so
-_SLOW_S = 0.15  # between samples; robots report 10 to 1000 times a second
+_GAP_S = 0.5  # a step between samples that is longer than this and than five usual steps is not interpolated
+_FARTHEST_MM = 1e5  # coordinates beyond this cannot be in millimetres
+_ORDER = "time_s must be a number, larger than in the row before"
+_LONGER = 5.0  # if a log is longer than its video by this factor, the times of the frames may be missing
+_COVERED = 0.75  # fewest frames with a position, as a share; with fewer, log and video do not belong together
+_JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgical robot is faster
+_SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
 class Doubt(NamedTuple):
-    """What makes a recording suspicious though it can be read: its name, plain words with the numbers, and what to do."""
+    """A reason why a readable recording is suspicious: a name, a sentence with the numbers, and the cure."""
 
     name: str
     text: str
@@ -72,14 +72,14 @@ class Kinematics:
     def at(self, time_s: ArrayLike) -> np.ndarray:
         """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
-        NaN before the first sample, after the last, beside a dropped one, and in a gap of half a second and five samples.
+        NaN before the first sample, after the last, next to a dropped one, and in steps over 0.5 s and five usual steps.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
         if time.ndim != 2 or time.shape[1] != k:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
         x, known = np.empty((*time.shape, 3)), time[np.isfinite(time)]
-        # A frame asks for few samples of a log that may have a million.
+        # A log may have a million samples, of which a frame needs few.
         low, high = np.searchsorted(self.time_s, (known.min(), known.max())) if known.size else (0, 0)
         near_s, near_mm = (part[max(low - 2, 0) : high + 2] for part in (self.time_s, self.x_mm))
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
@@ -92,7 +92,7 @@ class Kinematics:
 
     @cached_property
     def _longest_step_s(self) -> float:
-        """Between samples, beyond which there is a gap."""
+        """The longest step between samples, in s, that is interpolated."""
         return max(_GAP_S, 5.0 * float(np.median(np.diff(self.time_s))))
 
 
@@ -103,12 +103,12 @@ class Recording:
     Attributes:
         image_size_px: (width, height).
         skeleton: Names of the 2 to 8 landmarks; the detector knows those of a forceps.
-        bit_depth: How many bits frames of 16 bits use; 0 for frames of 8 bits.
+        bit_depth: Number of bits that 16-bit frames use; 0 for 8-bit frames.
         readout_s: Time from the first to the last row of a rolling shutter; 0 is a global shutter.
         offset_s: t_robot = t_video + offset_s.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
-        details: Own notes of whoever wrote the recording.
-        annotations, truth: None where the recording has none.
+        details: Notes of the recording's author.
+        annotations, truth: None if the recording has none.
     """
 
     folder: Path
@@ -132,10 +132,10 @@ class Recording:
 
     @classmethod
     def open(cls, folder: str | Path, *, truth: bool = True) -> Self:
-        """Open and validate a recording; what is suspicious (`doubts`) is a `UserWarning`.
+        """Open and validate a recording; each of its `doubts` is a `UserWarning`.
 
         Sizes, counts, headers and ends of all images are checked here.  Errors name the file, the line and the cure.  With
-        truth=False the truth of a simulated recording is left alone.
+        truth=False the truth of a simulated recording is not read.
 
         >>> from lib import paths
         >>> recording = Recording.open(paths.SHIPPED_RECORDING)
@@ -160,8 +160,8 @@ class Recording:
         kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
-            seen, told = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
-            what = f"the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap"
+            seen, logged = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
+            what = f"the frames ({seen}, robot clock) and kinematics.csv ({logged}) do not overlap"
             raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
         annotations = read_coco(path, n, size, skeleton) if path.exists() else None
@@ -174,7 +174,7 @@ class Recording:
 
     @property
     def doubts(self) -> list[Doubt]:
-        """What makes the recording suspicious though it can be read."""
+        """The reasons why the recording is suspicious, although it can be read."""
         n, frame_s, log_s = len(self), self.frames.time_s + self.offset_s, self.kinematics.time_s
         span, logged, step = float(np.ptp(frame_s)), float(np.ptp(log_s)), np.diff(log_s)
         uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
@@ -197,16 +197,16 @@ class Recording:
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
         )  # fmt: skip
-        return [Doubt(*told) for holds, *told in cases if holds]
+        return [Doubt(*doubt) for holds, *doubt in cases if holds]
 
     @property
     def mistimed(self) -> str:
-        """Doubts of units and gaps of time, with their cures, or "": where no calibration is found, this comes first."""
+        """Doubts about times, with their cures, or "".  If no calibration is found, correct these first."""
         of_time = [doubt for doubt in self.doubts if doubt.name in ("slow_log", "frame_times", "little_overlap")]
         return " ".join(f"{doubt.text} {doubt.cure}" for doubt in of_time)
 
     def frames_of(self, text: str) -> range:
-        """The frames that --frames names by "A:B", from A to before B, negative from the end; a ValueError without any."""
+        """The frames of --frames "A:B": from A to before B, negative numbers from the end; a ValueError if there are none."""
         ends = re.fullmatch(r"(-?\d+)?:(-?\d+)?", text)
         frames = range(len(self))[slice(*(int(end) if end else None for end in ends.groups()))] if ends else range(0)
         if not frames:
@@ -215,28 +215,28 @@ class Recording:
         return frames
 
     def showing(self, frames: range) -> Self:
-        """The recording with the nearest picture of `frames` in place of each other one; numbers, times and ground stay.
+        """A copy in which the nearest picture of `frames` replaces each other picture; numbers, times and ground stay.
 
-        So whoever looks at some pictures does not see where cameras stood before or after.
+        Code that samples pictures then sees none that was taken before or after `frames`, when cameras stood elsewhere.
         """
         if len(frames) == len(self):
             return self
         sides = [lambda i, side=side: getattr(self.frames[min(max(i, frames[0]), frames[-1])], side) for side in SIDES]
         part = replace(self, frames=Frames(*sides, self.frames.time_s))
-        part.__dict__["ground"] = self.ground  # that of the detections
+        part.__dict__["ground"] = self.ground  # the detections were made with it
         return part
 
     @cached_property
     def ground(self) -> Ground:
-        """What the cameras see behind the tool, by the images' dates; a detector in doubt looks at what differs from it."""
+        """The images behind the tool, with sizes and dates of the files as key.  A detector in doubt uses them."""
         files = [path for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name))]
         changed = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.is_file()]
         return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {changed}")
 
     def landmarks_mm(self) -> np.ndarray:
-        """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
+        """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot does not report them.
 
-        `lib.correspondences.of_recording` gives them at the instants at which the landmarks' image rows were read.
+        `lib.correspondences.of_recording` gives them at the times at which the landmarks' image rows were read.
         """
         return self.kinematics.at(self.frames.time_s + self.offset_s)
 
@@ -285,7 +285,7 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     empty, far = np.isnan(x), np.abs(np.nan_to_num(x)) > _FARTHEST_MM
     refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
     refuse(path, far.any(axis=(1, 2)), f"beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty")
-    problem = "a landmark has some coordinates only; leave all three cells of a dropped landmark empty"
+    problem = "a landmark lacks some coordinates; leave all three cells of a dropped landmark empty"
     refuse(path, (empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1), problem)
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
@@ -298,13 +298,13 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
 
 
 class RecordingWriter:
-    """Context manager that writes a recording beside its final place `folder`, and moves it there when it is valid.
+    """Context manager that writes a recording to a temporary folder, and moves it to `folder` if it is valid.
 
-    Args, beside those that are as in `Recording`:
-        details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
+    Args, apart from those of `Recording`:
+        details: Your own notes (numbers and text), kept in ``[details]`` of recording.toml.
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
-        overwrite: Replace a recording of that name; any other folder that exists is a FileExistsError.  Its labels stay
-            where the frames are the same; what else the new one lacks stays in a folder beside, and a `UserWarning` says so.
+        overwrite: Replace a recording of that name; any other existing folder is a FileExistsError.  Labels are kept if all
+            frames are the same.  A `UserWarning` names the folder that keeps whatever else differs.
 
     >>> import tempfile
     >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
@@ -381,9 +381,9 @@ class RecordingWriter:
         self._annotations = Annotations(*u_and_visibility)
 
     def draft(self, offset_s: float | None = None) -> Recording:
-        """The recording as it is so far, valid or a ValueError; it lies in a folder that is removed if anything fails.
+        """The recording as written so far, or a ValueError if it is not valid; it lies in the temporary folder.
 
-        `offset_s` replaces what was given, where a first draft was needed to find it.
+        `offset_s` replaces the constructor's, for a clock offset that is estimated from a first draft.
         """
         if offset_s is not None:
             self._header["offset_s"] = float(offset_s)
@@ -405,17 +405,17 @@ class RecordingWriter:
         return Recording.open(self.folder)
 
     def _carry_labels(self) -> None:
-        """Labels of the recording that is replaced belong to the new one too if its frames are the same, byte for byte."""
+        """Copy the labels of the recording that is replaced, if all frames are the same, byte for byte."""
         old, new = self.target / "annotations.json", self.folder / "annotations.json"
         frames = [path.relative_to(self.folder) for side in SIDES for path in (self.folder / side).iterdir()]
         if old.is_file() and not new.exists() and all(_same(self.target / path, self.folder / path) for path in frames):
-            with contextlib.suppress(ValueError):  # of other landmarks
+            with contextlib.suppress(ValueError):  # raised if the labels are of other landmarks
                 read_coco(old, len(self._time_s), self.image_size_px, self._header["skeleton"])
                 write_bytes(new, old.read_bytes())
 
     def _finish(self) -> None:
         self._carry_labels()
-        self.draft()  # what is not valid must not appear
+        self.draft()  # raises an error if the recording is not valid
         self._check_target()
         old = self.folder.with_suffix(".replaced")
         if self.target.exists():
@@ -435,17 +435,17 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _keep_apart(old: Path, new: Path) -> None:
-    """Remove from the folder `old` what `new` holds too; the rest may be a person's work.  A link goes without its folder."""
+    """Remove from folder `old` what `new` holds too; the rest may be a person's work.  A link `old` itself is removed."""
     if old.is_symlink():
         old.unlink()
         return
-    for path in sorted(old.rglob("*"), reverse=True):  # a folder after what it holds
+    for path in sorted(old.rglob("*"), reverse=True):  # a folder comes after its content
         if _same(path, new / path.relative_to(old)):
             path.unlink()
         elif path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
             path.rmdir()
-    if theirs := sorted({path.name for path in old.iterdir()} - {"import.json"}):
-        what = f"the recording that it replaces held other {', '.join(theirs)}"
+    if kept := sorted({path.name for path in old.iterdir()} - {"import.json"}):
+        what = f"the recording that it replaces held other {', '.join(kept)}"
         warnings.warn(f"{new}: {what}, which {old} keeps. Remove what you do not need.", stacklevel=4)
     else:
         shutil.rmtree(old, ignore_errors=True)

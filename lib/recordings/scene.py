@@ -1,4 +1,4 @@
-"""What lies behind the tool, as a witness of whether cameras moved."""
+"""The scene behind the tool: its shift in the images shows whether the cameras moved."""
 
 from itertools import product
 from typing import NamedTuple, Self
@@ -6,26 +6,26 @@ from typing import NamedTuple, Self
 import cv2
 import numpy as np
 
-_STEP = 4  # every n-th pixel is compared; the noise of a sensor never repeats
-_SCENE_PX, _TILES = (384, 216), 4  # size at which scenes are compared, in 4 x 4 tiles, whose sides suit OpenCV's transform
-_TEXTURE, _FEWEST, _LEAST_PX = 0.1, 4, 16  # least response of a tile that shows anything, fewest of them, least size
+_STEP = 4  # every fourth pixel is kept; that also suffices to find repeated images, since a sensor's noise never repeats
+_SCENE_PX, _TILES = (384, 216), 4  # size at which scenes are compared, in 4 x 4 tiles; their sides suit OpenCV's transform
+_TEXTURE, _FEWEST, _LEAST_PX = 0.1, 4, 16  # least response of a textured tile, fewest such tiles, least side of a tile
 
 
 class Scene(NamedTuple):
-    """What two images show, to tell whether it moved: every fourth pixel of each, (h, w, 3) uint8."""
+    """Every fourth pixel of a stereo pair, (h, w, 3) uint8 each, to measure whether the scene moved."""
 
     left: np.ndarray
     right: np.ndarray
 
     @classmethod
     def of(cls, left: np.ndarray, right: np.ndarray) -> Self:
-        """Of images (h, w, 3) uint8."""
+        """The scene of two images (h, w, 3) uint8."""
         return cls(*(np.ascontiguousarray(image[::_STEP, ::_STEP]) for image in (left, right)))
 
     def moved_px(self, other: Self) -> np.ndarray:
-        """(2,) px of the full images by which nearly all of the left and right image moved to `other`, at most.
+        """(2,) px of the full images, left and right: the largest shift to `other` among the 80 % of tiles that move least.
 
-        NaN where they show too little to tell.  The tool covers a few tiles, and what surrounds it decides.
+        NaN if too few tiles have texture.  The moving tool covers few tiles, so the rest of the image decides.
 
         >>> dots = np.random.default_rng(0).integers(0, 255, (27, 48), dtype=np.uint8)
         >>> dots = cv2.resize(cv2.merge([dots] * 3), (480, 270), interpolation=cv2.INTER_CUBIC)

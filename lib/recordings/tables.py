@@ -24,7 +24,7 @@ def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[s
 
 
 def decoded(path: Path, *, utf_16: bool = False) -> str:
-    """The text of a UTF-8 file, or also, where its first bytes say so, of a UTF-16 one."""
+    """The text of a UTF-8 file; with `utf_16` also of a UTF-16 file that starts with a byte order mark."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; check its name.")
     data = path.read_bytes()
@@ -44,7 +44,7 @@ def read_toml(path: Path) -> dict:
 
 
 def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:
-    """Place ("FILE, line N") and stripped cells of the header and of each row, all as long; blank lines are left out."""
+    """Yield place ("FILE, line N") and stripped cells of header and rows, equally many in each; blank lines are skipped."""
     reader, n = csv.reader(io.StringIO(text, newline=""), delimiter=separator), 0
     try:
         for cells in reader:
@@ -73,8 +73,8 @@ def number(cell: str, place: str, column: str) -> float:
 def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n_frames: int | None = None) -> np.ndarray:
     """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
 
-    A file has all of the optional columns or none of them; then they are NaN.  With `n_frames` the first column must
-    number the frames from 0.  Errors name file and line; "nan" is one, since a missing value is an empty cell.
+    A file has all of the optional columns, or none of them and they are NaN.  With `n_frames` the first column must number
+    the frames from 0.  Errors name file and line.  The text "nan" is an error, since a missing value is an empty cell.
     """
     text = decoded(path)
     rows = rows_of(path, text)
@@ -82,15 +82,15 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
     wanted = [*names, *optional] if set(header) & set(optional) else list(names)
     if other := next((name for sign, name in ((";", "semicolons"), ("\t", "tabs")) if sign in "".join(header)), ""):
         cure = "Save it with commas between cells and points in numbers"
-        raise ValueError(f"{path}, line 1: {other} part its cells. {cure}.")
+        raise ValueError(f"{path}, line 1: {other} separate its cells. {cure}.")
     if header != wanted:
         missing, unknown = ([n for n in one if n not in other] for one, other in ((wanted, header), (header, wanted)))
         detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
         found = "; ".join(detail) or "order or repetition"
         raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
     found, body = np.empty((0, 0)), text.replace("\r\n", "\n").partition("\n")[2]
-    if not any(letter in body for letter in "\rnN"):  # no NaN but that of an empty cell
-        with suppress(ValueError):  # the quick way, which names no lines
+    if not any(letter in body for letter in "\rnN"):  # then only empty cells can be NaN
+        with suppress(ValueError):  # the fast way; if it fails, the slow one names the line
             found = np.array([[float(cell or "nan") for cell in row.split(",")] for row in body.split("\n") if row], ndmin=2)
     if found.shape[1] != len(wanted) or np.isinf(found).any():
         found = [[number(cell, place, name) for cell, name in zip(cells, wanted, strict=True)] for place, cells in rows]
@@ -103,13 +103,13 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
 
 
 def refuse(path: Path, bad: np.ndarray, problem: str) -> None:
-    """Raise a ValueError that names the line of the first row (m,) that is `bad`, if there is one."""
+    """Raise a ValueError that names the line of the first row that is `bad` (m,), if there is one."""
     if bad.any():
         raise ValueError(f"{path}, line {int(bad.argmax()) + 2}: {problem}.")
 
 
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:
-    """Write what `read_table` reads: NaN as an empty cell, `decimals` places in each column."""
+    """Write a table that `read_table` reads: NaN as an empty cell, and in each column its number of `decimals`."""
     rows = io.StringIO()
     np.savetxt(rows, np.reshape(values, (-1, len(names))), [f"%.{places}f" for places in decimals], delimiter=",")
     write_text(path, ",".join(names) + "\n" + rows.getvalue().replace("nan", ""))

@@ -1,4 +1,4 @@
-"""What a simulator knows about a recording: the cameras, the landmarks and the surface, exactly."""
+"""The truth of a simulated recording: exact cameras, landmarks and surface."""
 
 import zipfile
 from dataclasses import dataclass
@@ -22,16 +22,16 @@ _GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])  # optional, after
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulator knows.  For evaluation only: no estimator may see it.
+    """The truth of a simulated recording.  For evaluation only: no estimator may use it.
 
     Attributes:
         rig: The exact cameras, affine or near-affine.
         landmarks_mm: (n, 3, 3) exact landmarks at the frames' times, robot frame.
         u_left, u_right: (n, 3, 2) exact px.
         visibility_left, visibility_right: (n, 3) int: 0 outside the image, 1 hidden, 2 visible.
-        folder: truth/, for further files of a simulator.
-        in_glint_left, in_glint_right: (n, 3) bool, whether saturated light lies on the landmark or right beside it;
-            None if the recording does not say.
+        folder: truth/, which may hold further files of the simulator.
+        in_glint_left, in_glint_right: (n, 3) bool, True if saturated light lies on the landmark or within 3 px of it;
+            None if the recording does not state it.
     """
 
     rig: StereoRig
@@ -46,7 +46,7 @@ class Truth:
 
     @classmethod
     def read(cls, folder: Path, n: int) -> Self:
-        """The truth of `n` frames; errors name the file."""
+        """Read the truth of `n` frames; errors name the file."""
         path = folder / "landmarks.csv"
         table = read_table(path, _COLUMNS, optional=_GLINT_COLUMNS, n_frames=n)
         u, visibility = np.split(table[:, 10:28].reshape(n, 3, 2, 3), [2], axis=-1)
@@ -60,9 +60,9 @@ class Truth:
         return cls(rig, x, u[:, :, 0], u[:, :, 1], visibility[:, :, 0], visibility[:, :, 1], folder, *in_glint)
 
     def write(self, surface: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None) -> None:
-        """Write what `read` reads into `folder`, which is made; of a `RecordingWriter` that is ``writer.folder / "truth"``.
+        """Write files that `read` reads into `folder`, which is made.  A `RecordingWriter` has ``writer.folder / "truth"``.
 
-        `surface` is (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen on a grid of left pixels.
+        `surface` is (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen at a grid of left pixels.
         """
         self.folder.mkdir(exist_ok=True)
         self.rig.save(self.folder / "rig.json")
@@ -95,5 +95,5 @@ class Truth:
             raise ValueError(f"{path}: not a surface grid with x_px, y_px, x_mm ({error}).") from None
 
     def surface(self, u_left: ArrayLike) -> np.ndarray:
-        """The surface points (n, 3) mm, robot frame, seen at left pixels (n, 2); NaN off the stored grid."""
+        """The surface points (n, 3) mm, robot frame, seen at left pixels (n, 2); NaN outside the stored grid."""
         return self._surface(points(u_left, 2, "u_left")[:, ::-1])

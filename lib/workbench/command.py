@@ -1,4 +1,4 @@
-"""``python3 -m lib run``: the notebooks one after the other, and the report that grows beside them."""
+"""``python3 -m lib run``: executes the notebooks one after the other, and updates the report after each."""
 
 import argparse
 import contextlib
@@ -19,19 +19,19 @@ from lib.provenance import commit, machine
 from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
 
-#: Keeps room on the disk to write the last state of a run when the disk is full.
+#: A file that reserves space, so that a run can write its last state when the disk is full.
 _ROOM = ".room"
 
 
 def main(argv: Sequence[str]) -> int:
-    """Parse the command line and run: 0 if every notebook came to its end, 1 if one failed, 128 + n for signal n."""
+    """Parse the command line and run: 0 if every notebook completed, 1 if one failed, 128 + n for signal n."""
     parser = argparse.ArgumentParser("python3 -m lib run", description="Execute notebooks; report in runs/<date>-<profile>/.")
     add = parser.add_argument
     add("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
     add("--profile", choices=("quick", "paper"), default="quick", help="quick: minutes; paper: the paper's sizes")
-    add("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="a declared parameter")
+    add("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="set a declared parameter")
     add("--cell-timeout", type=execution.positive, metavar="S", help="longest time of one cell (default: 900 for quick)")
-    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
+    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="folder for the run's folder")
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
     received = []
@@ -40,17 +40,17 @@ def main(argv: Sequence[str]) -> int:
         received.append(number)
         raise KeyboardInterrupt
 
-    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C: the report then says that the run was stopped
-        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:  # as nohup has it
+    for name in ("SIGTERM", "SIGHUP"):  # as with Ctrl-C, the report then states that the run was stopped
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:  # nohup ignores one
             signal.signal(getattr(signal, name), stop)
     result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
     return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
 
 
 def main_site(argv: Sequence[str]) -> int:
-    """Copy the pages of a run into a folder that a web server shows as it is."""
-    parser = argparse.ArgumentParser("python3 -m lib site", description="Make a static site of a run, as for GitHub Pages.")
-    parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
+    """Copy a run into a folder that a web server can serve unchanged."""
+    parser = argparse.ArgumentParser("python3 -m lib site", description="Make a static site of a run, for GitHub Pages.")
+    parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete run)")
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
     options = parser.parse_args(argv)
     chosen = options.run or next((folder for folder, _ in reversed(complete_runs(paths.RUNS))), paths.RUNS)
@@ -58,8 +58,8 @@ def main_site(argv: Sequence[str]) -> int:
         raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
     if options.out.exists() or not options.out.absolute().parent.is_dir():
         raise OSError(f"{options.out}: it exists already, or the folder for it does not; name another with --out.")
-    with tempfile.TemporaryDirectory(prefix="site-", dir=options.out.absolute().parent) as made:  # half a site is none
-        (shutil.copytree(chosen, Path(made) / "site") / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
+    with tempfile.TemporaryDirectory(prefix="site-", dir=options.out.absolute().parent) as made:  # no half site may appear
+        (shutil.copytree(chosen, Path(made) / "site") / ".nojekyll").touch()  # makes GitHub Pages serve every file unchanged
         (Path(made) / "site").rename(options.out)
     print(f"Site: {options.out / 'index.html'}")
     return 0
@@ -69,11 +69,11 @@ def run(
     names: Sequence[str] = (), profile: str = "quick", pairs: Sequence[tuple[str, str]] = (), *,
     cell_timeout_s: float | None = None, runs: Path = paths.RUNS, notebooks: Path = paths.NOTEBOOKS,
 ) -> dict:  # fmt: skip
-    """Execute notebooks into a new folder of `runs`, and return its metrics.json; the others still run when one fails.
+    """Execute notebooks into a new folder of `runs`, and return the content of its metrics.json.
 
-    Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.  Before
-    anything runs a ValueError refuses an unknown notebook or parameter, or a value of the wrong type; an OSError says that
-    the report cannot be written (its state is "failed" if that can still be written).
+    If a notebook fails, the others still run.  The report is written after each, so a killed run leaves a readable one.  An
+    unknown notebook or parameter, or a value of the wrong type, is a ValueError before anything runs.  An OSError means that
+    the report cannot be written; its state is then "failed", if that can still be written.
     """
     chosen = execution.choose_notebooks(names, notebooks)
     values = execution.parse_parameters(pairs, chosen, profile)
@@ -82,7 +82,7 @@ def run(
     try:
         paths.CACHE.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
-            os.environ[paths.SHARED_VARIABLE] = shared  # the kernels inherit it
+            os.environ[paths.SHARED_VARIABLE] = shared  # inherited by the kernels
             for number, book in enumerate(chosen):
                 label = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}"
                 start = time.monotonic()
@@ -95,11 +95,11 @@ def run(
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
-        with contextlib.suppress(OSError):  # the terminal may have gone
+        with contextlib.suppress(OSError):  # the terminal may be closed
             print("\nStopped.")
     except OSError as error:
         report.finish("failed")
-        raise OSError(f"{error}. The run in {paths.shown(report.folder)} ends here; see to its disk.") from error
+        raise OSError(f"{error}. The run in {paths.shown(report.folder)} ends here; check its disk.") from error
     finally:
         os.environ.pop(paths.SHARED_VARIABLE, None)
     for entry in report.content["notebooks"]:
@@ -118,7 +118,7 @@ def complete_runs(runs: Path) -> list[tuple[Path, dict]]:
     """The folders of complete runs in `runs` with their metrics.json, the last run last."""
     found = []
     for file in runs.glob("*/metrics.json"):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # another version's, or cut off
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # written by another version, or cut off
             content = json.loads(file.read_text(encoding="utf-8"))
             if (content["format"], content["state"]) == ("microstereo.metrics", "complete") and content["started"]:
                 found.append((file.parent, content))
@@ -136,7 +136,7 @@ def previous_values(runs: Path, content: dict) -> dict[str, float | None]:
 
 
 class _Report:
-    """The folder of a run and the content of its metrics.json, kept in step."""
+    """Writes the folder of a run: metrics.json with its `content`, the page of each notebook, figures and index.html."""
 
     def __init__(self, folder: Path, notebooks: Sequence[Path], profile: str, given: dict[str, str]):
         self.folder, self.notebooks, self.start = folder, notebooks, time.monotonic()
@@ -158,14 +158,14 @@ class _Report:
         self.write()
 
     def end(self, number: int, failure: Failure | None, seconds: float) -> None:
-        """Collect what a notebook recorded (also one that failed, up to there) and write its page."""
+        """Collect what a notebook recorded, even if it failed later, and write its page."""
         book, content = self.notebooks[number], self.content
         entry, executed = content["notebooks"][number], self.folder / book.name
         entry |= {"state": "failed" if failure else "complete", "seconds": round(seconds, 2)}
         entry["failure"] = failure._asdict() if failure else None
         try:
             stated = execution.stated_in(executed)
-        except (OSError, ValueError):  # there is none, or a full disk has cut it off
+        except (OSError, ValueError):  # it is missing, or a full disk has cut it off
             executed.unlink(missing_ok=True)
         else:
             entry |= {"left_out": stated.left_out} | (stated.verdict or {})
@@ -199,7 +199,7 @@ class _Report:
         if self.content["download"]:
             try:
                 shutil.move(shutil.make_archive(str(self.folder), "zip", self.folder.parent, self.folder.name), self.folder)
-            except OSError:  # a disk without room for the copy
+            except OSError:  # the disk has no room for the zip
                 Path(f"{self.folder}.zip").unlink(missing_ok=True)
                 self.content["download"] = None
                 self.write()
@@ -211,7 +211,7 @@ class _Report:
 
 
 def _new_folder(runs: Path, profile: str) -> Path:
-    """``<date>-<profile>``, and with ``-2``, ``-3``, ... where that is taken: no run touches another's files."""
+    """Make the folder ``<date>-<profile>``, or with ``-2``, ``-3``, ... if that exists: no run changes another's files."""
     runs.mkdir(parents=True, exist_ok=True)
     stem = f"{datetime.date.today().isoformat()}-{profile}"
     for number in itertools.count(1):

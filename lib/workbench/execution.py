@@ -1,4 +1,4 @@
-"""Notebooks and the values of their parameters, checked before anything runs; their execution, and what they stated."""
+"""Chooses notebooks, checks their parameters before anything runs, executes them, and reads back what they stated."""
 
 import argparse
 import ast
@@ -22,25 +22,25 @@ from lib import paths
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
 #: Packages whose version can change a number.
-_TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
+_PACKAGES = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
 #: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
-#: What kernels inherit: this interpreter's own kernel, quiet libraries, and that nobody answers what they show.
+#: Environment variables for the kernels.
 _KERNEL_ENVIRONMENT = {
-    "MICROSTEREO_PAGE": "1",
-    "JUPYTER_PREFER_ENV_PATH": "1",  # a kernel named python3 elsewhere on the machine must not win
+    "MICROSTEREO_PAGE": "1",  # controls must work in a page, without a kernel
+    "JUPYTER_PREFER_ENV_PATH": "1",  # use this environment's kernel, not another one named python3
     "OPEN3D_DISABLE_WEB_VISUALIZER": "true",  # it hangs without a display
-    "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # a warning of the debugger on every start
+    "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # suppresses a warning of the debugger on every start
 }
 
 
 def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) -> list[Path]:
-    """The notebooks named, in the order of the paper; all of them for no name.
+    """The named notebooks in the order of the paper; all of them if no name is given.
 
-    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.  A ValueError
-    for a name that fits none lists what there is.
+    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by their stem too.  An
+    unknown name is a ValueError that lists the notebooks.
     """
     shipped = sorted(folder.glob("[0-9]*.ipynb"))
     if not names:
@@ -60,12 +60,12 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
 
 
 def declared_parameters(notebook: Path) -> dict[str, str]:
-    """Names and declared types ("int", "str", ...; "" where none is) of the cell tagged ``parameters``."""
+    """Names and types ("int", "str", ...; "" if not declared) of the parameters in the cell tagged ``parameters``."""
     return {name: (entry["inferred_type_name"] or "").replace("None", "") for name, entry in _inspect(notebook).items()}
 
 
 def declared_grid(notebook: Path) -> dict[str, list[str]]:
-    """The values that a sweep tries, as texts: those that comments of the parameters name after ``; grid:``."""
+    """The values that a sweep tries, as texts.  Comments of the parameters list them after ``; grid:``."""
     found = {name: _GRID.search(entry["help"] or "") for name, entry in _inspect(notebook).items()}
     return {name: split_values(grid[1]) for name, grid in found.items() if grid}
 
@@ -80,9 +80,9 @@ def split_values(text: str) -> list[str]:
 
 
 def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path], profile: str = "quick") -> dict[Path, dict]:
-    """What each notebook is given: the pairs that it declares, and the profile, as values of the declared type.
+    """The parameters of each notebook: those of the pairs that it declares, and the profile, converted to the declared type.
 
-    A ValueError if no chosen notebook declares a name, or a text does not fit the declared type.
+    Raises a ValueError if no chosen notebook declares a name, or if a text does not fit the declared type.
     """
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}
@@ -95,7 +95,7 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
 
 
 def positive(text: str) -> float:
-    """A number of seconds on a command line; an `argparse.ArgumentTypeError` for anything but a finite number above 0."""
+    """Parse seconds on a command line; an `argparse.ArgumentTypeError` for anything but a finite number above 0."""
     with suppress(ValueError):
         if 0 < float(text) < math.inf:
             return float(text)
@@ -110,7 +110,7 @@ def title_of(notebook: Path) -> str:
 
 
 def _value(name: str, text: str, kind: str) -> object:
-    """`text` as the declared type; without one, as the Python literal it is, or else as text."""
+    """Convert `text` to the declared type; without one, to a Python literal if it is one, else leave it as text."""
     kind = kind.split("|")[0].strip().split("[")[0]
     words = {"true": True, "false": False, "1": True, "0": False}
     simple = {"str": str, "int": int, "float": float, "bool": lambda text: words[text.lower()]}
@@ -118,7 +118,7 @@ def _value(name: str, text: str, kind: str) -> object:
         value = simple.get(kind, ast.literal_eval)(text)
         if kind in ("list", "tuple", "dict", "set") and type(value).__name__ != kind:
             raise ValueError(f"a {type(value).__name__}")
-        return list(value) if isinstance(value, tuple | set) else value  # of papermill's they would be texts
+        return list(value) if isinstance(value, tuple | set) else value  # papermill passes these as text
     except (ValueError, KeyError, SyntaxError):
         if kind in (*simple, "list", "tuple", "dict", "set"):
             raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
@@ -128,15 +128,15 @@ def _value(name: str, text: str, kind: str) -> object:
 def _inspect(notebook: Path) -> dict[str, dict]:
     import papermill
 
-    logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # no warnings about notebooks without a parameters cell
     try:
         return papermill.inspect_notebook(str(notebook))
-    except (OSError, ValueError, nbformat.ValidationError) as error:  # also text that is not JSON
+    except (OSError, ValueError, nbformat.ValidationError) as error:  # a ValueError if the text is not JSON
         raise ValueError(f"{notebook}: not a notebook ({error}).") from None
 
 
 class Failure(NamedTuple):
-    """Why a notebook did not get to its end: `cell` counts its cells from 1."""
+    """Why a notebook did not complete; `cell` counts its cells from 1."""
 
     kind: str  # "error", "timeout" or "dead kernel"
     cell: int | None
@@ -149,9 +149,9 @@ class Failure(NamedTuple):
 def execute(
     notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None, label: str = ""
 ) -> Failure | None:
-    """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
+    """Execute `notebook` into `output`, which is written after each cell; returns None if every cell completed.
 
-    With a `label` a terminal shows how many cells are done.
+    With a `label` a terminal shows the number of cells that are done.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError, strip_color
@@ -160,20 +160,20 @@ def execute(
 
     def on_cell_start(cell, cell_index):
         nonlocal running
-        running += "injected-parameters" not in cell.metadata.get("tags", [])  # papermill's own, which no author counts
+        running += "injected-parameters" not in cell.metadata.get("tags", [])  # papermill's own does not count
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
-    logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
+    logging.getLogger("papermill").setLevel(logging.CRITICAL)  # the returned failure contains its messages
     try:
         papermill.execute_notebook(
             str(notebook), str(output), parameters, kernel_name="python3", execution_timeout=cell_timeout_s,
             progress_bar={"desc": label, "leave": False, "disable": not (label and sys.stderr.isatty())},
-            start_timeout=600,  # of the kernel: a busy machine takes its time
-            on_cell_start=on_cell_start,  # this and the next are for nbclient
-            extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
+            start_timeout=600,  # a kernel may start slowly on a busy machine
+            on_cell_start=on_cell_start,  # this and the next are passed to nbclient
+            extra_arguments=["--IPKernelApp.log_level=50"],  # suppresses a warning of unencrypted TCP on every start
         )  # fmt: skip
-    except PapermillExecutionError as error:  # none for `report.stop`
+    except PapermillExecutionError as error:  # `report.stop` does not raise it
         return Failure("error", running, f"{error.ename}: {strip_color(error.evalue)}")
     except CellTimeoutError:
         return Failure("timeout", running, f"the cell took longer than {cell_timeout_s:g} s (--cell-timeout).")
@@ -185,16 +185,16 @@ def execute(
 
 
 class Stated(NamedTuple):
-    """What an executed notebook stated: of metrics and pictures with one name the last, in the order of the first."""
+    """What an executed notebook stated.  If it stated a name several times, the last counts, in the place of the first."""
 
     metrics: list[dict]  # each with its `cell`
     figures: list[tuple[dict, str, bytes]]  # name and caption, ".svg" or ".png", the file's content
-    verdict: dict | None  # `verdict` and `reasons` of all that it stated, joined
+    verdict: dict | None  # its verdicts, `joined`
     left_out: str | None  # why `report.stop` ended it before its last cell
 
 
 def stated_in(executed: Path) -> Stated:
-    """Read back what `lib.workbench.report` put into an executed notebook."""
+    """Read what `lib.workbench.report` wrote into an executed notebook."""
     metrics, figures, verdicts, left_out = {}, {}, [], None
     for cell in nbformat.read(executed, as_version=4).cells:
         for output in cell.get("outputs", []):
@@ -211,7 +211,7 @@ def stated_in(executed: Path) -> Stated:
 
 
 def joined(verdicts: Iterable[dict | None]) -> dict | None:
-    """The worst verdict with the reasons of all, each once and the worst first; None if there is none."""
+    """The worst of the verdicts, with the reasons of all, each once and the worst first; None if there is no verdict."""
     if not (found := [verdict for verdict in verdicts if verdict and verdict["verdict"]]):
         return None
     rank = list(VERDICT_COLOURS).index
@@ -222,4 +222,4 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
 
 def versions() -> dict[str, str]:
     """Python and the packages whose version can change a number."""
-    return {"python": platform.python_version()} | {p.name: p.version for name in _TOLD for p in distributions(name=name)}
+    return {"python": platform.python_version()} | {p.name: p.version for name in _PACKAGES for p in distributions(name=name)}

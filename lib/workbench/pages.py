@@ -1,4 +1,4 @@
-"""The pages of a run: ``index.html``, and one page of each notebook.  They open without network, equations and all."""
+"""The pages of a run: ``index.html``, and one page of each notebook.  They open without a network; equations are SVG."""
 
 import html
 import math
@@ -18,18 +18,18 @@ from lib import paths
 from lib.workbench.execution import Failure, choose_notebooks
 from lib.workbench.report import format_value, rendered, with_unit
 
-#: plotly's script lies once beside the pages that show a 3D view.
+#: plotly's script, of which one copy lies beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
 _TEMPLATES = Path(__file__).with_name("templates")
-#: The forms of an output, from the one that a page shows best.
+#: Mime types of outputs; a page shows the first one that an output has.
 _RICHEST_FIRST = ["application/vnd.plotly.v1+json", "text/html", "application/vnd.jupyter.widget-view+json", "image/svg+xml",
                   "image/png", "image/jpeg", "text/markdown", "text/latex", "text/plain"]  # fmt: skip
-#: (level, anchor, text) of a heading that nbconvert has given an anchor.
+#: Finds (level, anchor, text) of a heading to which nbconvert has given an anchor.
 _HEADING = re.compile(r'<h([23]) id="([^"]+)">(.*?)<a class="anchor-link"', re.DOTALL)
-#: State of the notebook -> why it did not state a number; None: it is not part of the run.
+#: State of a notebook (None: it is not part of the run) -> why a number is missing.
 _MISSING = {None: "its notebook was not run", "pending": "not yet", "running": "not yet", "failed": "its notebook failed"}
 
-#: What the converter does not know, in its own words.
+#: TeX that the converter does not know -> equivalent TeX that it knows.
 _REWRITES = [
     (re.compile(r"\\operatorname\*\{([^{}]*)\}_(?:\{([^{}]*)\}|(\w))"), r"\\underset{\2\3}{\\mathrm{\1}}\\,"),
     (re.compile(r"\\operatorname\*?\{([^{}]*)\}"), r"\\mathrm{\1}\\,"),
@@ -44,19 +44,19 @@ _REWRITES = [
 
 @lru_cache(maxsize=4096)
 def equation_svg(tex: str, *, display: bool) -> str:
-    """An equation as inline SVG in HTML, on the line of the text; TeX that the converter cannot read is shown as it is."""
-    import ziamath  # not at the top: it takes half a second, and few commands need it
+    """An equation as inline SVG in HTML, aligned with the line of text; TeX that the converter cannot read stays TeX."""
+    import ziamath  # imported here, since it takes half a second and few commands need it
     from ziamath.tex import tex2mml
 
-    text = " ".join(tex.split())  # a line's end in \text is a space
+    text = " ".join(tex.split())  # a line break in \text is a space
     for pattern, replacement in _REWRITES:
         text = pattern.sub(replacement, text)
     try:
         if re.search(r"\\|&#x0005C;", tex2mml(text)):
             raise ValueError("a command that the converter does not know")
         drawn = ziamath.Latex(text, size=17.0, inline=not display)
-        picture = drawn.svg().replace(' xmlns="http://www.w3.org/2000/svg"', "")  # in a heading it would become a prefix
-    except Exception:  # whatever the converter stumbles over: the reader still gets the TeX
+        picture = drawn.svg().replace(' xmlns="http://www.w3.org/2000/svg"', "")  # else headings show "ns0:"
+    except Exception:  # whatever the converter cannot handle is shown as TeX
         return f'<code class="tex">{html.escape(tex)}</code>'
     label = html.escape(" ".join(tex.split()), quote=True)
     style = "" if display else f' style="vertical-align:{drawn.getyofst():.2f}px"'
@@ -65,7 +65,7 @@ def equation_svg(tex: str, *, display: bool) -> str:
 
 
 class _Renderer(IPythonRenderer):
-    """Markdown as JupyterLab shows it, equations drawn."""
+    """Renders Markdown as JupyterLab does, with equations as SVG."""
 
     def block_math(self, body: str) -> str:
         return equation_svg(body, display=True)
@@ -74,7 +74,7 @@ class _Renderer(IPythonRenderer):
         return equation_svg(body, display=False)
 
     def block_html(self, html: str) -> str:
-        # Without a picture to embed it stays as it is: a parser would close a tag that a later block closes.
+        # HTML without an image to embed stays unchanged, since a parser would close tags that a later block closes.
         return super().block_html(html) if "<img" in html else super(IPythonRenderer, self).block_html(html)
 
     def latex_environment(self, name: str, body: str) -> str:
@@ -82,7 +82,7 @@ class _Renderer(IPythonRenderer):
 
 
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
-    """Markdown with TeX as HTML, with pictures that it names relative to `folder`; HTML that is not `trusted` is escaped."""
+    """Convert Markdown with TeX to HTML.  Images are found relative to `folder`; HTML inside is escaped unless `trusted`."""
     how = {"escape": not trusted, "allow_harmful_protocols": trusted, "embed_images": True, "path": str(folder)}
     return MarkdownWithMath(renderer=_Renderer(attachments=attachments or {}, **how)).render(source)
 
@@ -90,7 +90,7 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
 def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, following: dict | None) -> str:
     """The HTML of an executed notebook whose source lies in `folder`.
 
-    `entry` is what metrics.json says of it; `previous` and `following` are the entries of its neighbours.
+    `entry` is the notebook's entry in metrics.json; `previous` and `following` are the entries of its neighbours.
     """
 
     @pass_context
@@ -101,7 +101,7 @@ def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, fo
     exporter = HTMLExporter(
         template_name="notebook", extra_template_basedirs=[str(_TEMPLATES)],
         filters={"markdown2html": prose, "untrusted_markdown": untrusted, "equation": equation_svg},
-        preprocessors=["nbconvert.preprocessors.CoalesceStreamsPreprocessor"],  # of a progress bar only its last state
+        preprocessors=["nbconvert.preprocessors.CoalesceStreamsPreprocessor"],  # keeps the last state of a progress bar
     )  # fmt: skip
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
     body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
@@ -121,14 +121,14 @@ def index_html(run: dict) -> str:
 
 
 def is_recorded(metric: dict) -> bool:
-    """Whether a metric was read from a record and not computed in the run, as its note says."""
+    """True if a metric's note states that it was read from a record and not computed in the run."""
     return bool(re.match(r"(.*, )?recorded\b", metric["note"]))
 
 
 def headlines(run: dict) -> tuple[list[dict], list[str]]:
-    """The rows of the table on top of index.html, and what has no row because the user's recording has no truth.
+    """The rows of the table at the top of index.html, and the names of rows that need a truth that the recording lacks.
 
-    ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
+    ``templates/headlines.toml`` lists these numbers and their targets; `run` is the content of metrics.json.
     """
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
     own = bool(run["parameters"].get("recording"))
@@ -158,7 +158,7 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
 
 
 def _range(low: float, high: float, unit: str) -> str:
-    """A target and its direction in words."""
+    """A target range and its direction in words."""
     if low == 0:
         return f"at most {with_unit(high, unit)} (lower is better)"
     if high == math.inf or (unit == "%" and high == 100):

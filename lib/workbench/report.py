@@ -1,7 +1,7 @@
-"""What a notebook states: metrics, figures and verdicts that the main job collects from the executed notebook.
+"""Functions with which a notebook states metrics, figures and verdicts; the main job collects them after its execution.
 
-They travel in the notebook's outputs (metrics and verdicts as JSON, a figure as a picture that knows its name), so an
-executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
+They are stored in the notebook's outputs (metrics and verdicts as JSON, a figure as an image whose metadata hold its name),
+so an executed notebook is a complete record of its results.  Outside Jupyter each prints one line.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING, NoReturn
 
 from jinja2 import Environment, FileSystemLoader
 
-if TYPE_CHECKING:  # at run time it would slow every notebook's start
+if TYPE_CHECKING:  # importing it would slow the start of every notebook
     from matplotlib.figure import Figure
 
-#: Mime types in a notebook's outputs: JSON of name, value, unit, paper and note; and of a `lib.trust.Verdict`.
+#: Mime types in a notebook's outputs: a metric (name, value, unit, paper, note) and a `lib.trust.Verdict`, as JSON.
 METRIC_MIME, VERDICT_MIME = "application/vnd.microstereo.metric+json", "application/vnd.microstereo.verdict+json"
-#: Keys of the output metadata: {"name": ..., "caption": ...} of a figure; why a notebook ended before its last cell.
+#: Keys of the outputs' metadata: name and caption of a figure; the reason why a notebook ended before its last cell.
 FIGURE_METADATA, STOP_METADATA = "microstereo_figure", "microstereo_stop"
 #: The colour of each verdict, from the best to the worst.
 VERDICT_COLOURS = {"trustworthy": "#067647", "doubtful": "#b54708", "not trustworthy": "#b42318"}
 _TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).with_name("templates")), autoescape=True)  # compiled once
-#: Longest SVG: the points of a large scatter are smaller as a PNG.
+#: Longest SVG; the many points of a scatter plot take less space as a PNG.
 _SVG_CHARACTERS = 200_000
 #: Name -> value of the metrics that this kernel recorded; None where a value could not be computed.
 RECORDED: dict[str, float | None] = {}
@@ -42,44 +42,44 @@ class _End(Exception):
         return []
 
 
-_End.__name__ = "SystemExit"  # papermill and JupyterLab know an error of this name, without a value, as an end in good order
+_End.__name__ = "SystemExit"  # papermill and JupyterLab treat an error of this name, without a value, as a regular end
 
 
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
-    """State one number: shown as a small row, and collected into the run's ``metrics.json``.
+    """State one number: it is shown as a small row, and collected into the run's ``metrics.json``.
 
     Args:
-        name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``; again in the
-            same notebook it replaces the value.
-        value: A number; NaN and infinity are stored as null (JSON has no word for them).
+        name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``.  Stating it again
+            in the same notebook replaces the value.
+        value: A number; NaN and infinity are stored as null, since JSON cannot represent them.
         unit: ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
-        paper: The paper's value in the same unit, where it states one.
+        paper: The paper's value in the same unit, if it states one.
         note: What a reader must know to judge the number: the data, the number of samples.
     """
-    theirs = None if paper is None else _number(paper, "paper")
-    metric = {"name": _checked_name(name), "value": _number(value, "value"), "unit": unit, "paper": theirs, "note": note}
+    published = None if paper is None else _number(paper, "paper")
+    metric = {"name": _checked_name(name), "value": _number(value, "value"), "unit": unit, "paper": published, "note": note}
     RECORDED[name] = metric["value"]
-    here, theirs = with_unit(metric["value"], unit), "" if paper is None else with_unit(metric["paper"], unit)
-    text = f"{name} = {here}{f' (paper: {theirs})' if theirs else ''}{f'  # {note}' if note else ''}"
-    page = rendered("metric.html", name=name, value=here, paper=theirs, note=note)
+    ours, theirs = with_unit(metric["value"], unit), "" if paper is None else with_unit(published, unit)
+    text = f"{name} = {ours}{f' (paper: {theirs})' if theirs else ''}{f'  # {note}' if note else ''}"
+    page = rendered("metric.html", name=name, value=ours, paper=theirs, note=note)
     _publish({METRIC_MIME: metric, "text/html": page, "text/plain": text})
 
 
 def verdict(found: object) -> None:
-    """State a verdict (`lib.trust.Verdict`), shown as a badge with its reasons; of several in a run the worst counts."""
+    """State a verdict (`lib.trust.Verdict`), shown as a badge with its reasons; the worst verdict of a run counts."""
     content = found.to_json()
     _publish({VERDICT_MIME: content, "text/html": rendered("verdict.html", content=content), "text/plain": str(found)})
 
 
 def rendered(template: str, **values: object) -> str:
-    """HTML from a file of ``templates/``; it escapes every value that it does not call safe."""
+    """HTML from a file of ``templates/``; every value is escaped unless the template marks it as safe."""
     return _TEMPLATES.get_template(template).render(values, colours=VERDICT_COLOURS)
 
 
 def show(figure: Figure, name: str, caption: str) -> None:
-    """Display a matplotlib figure with its caption and close it; an SVG where that is small and holds no image, else a PNG.
+    """Display a matplotlib figure with its caption and close it; it is an SVG if small and without images, else a PNG.
 
-    `name` is as in `record`, and the file's in the run's ``figures/``; `caption` is one line: what one sees, what to look at.
+    `name` is as in `record` and names the file in the run's ``figures/``; `caption` is one line: the content, where to look.
     """
     import matplotlib.pyplot as plt
 
@@ -111,7 +111,7 @@ def _drawn(figure: Figure) -> tuple[str, str]:
 
 @contextmanager
 def timed(stage: str) -> Iterator[None]:
-    """Record the wall-clock seconds of the block as the metric ``seconds_<stage>``; nothing if the block raises."""
+    """Record the wall-clock time of the block as the metric ``seconds_<stage>``, unless the block raises an error."""
     name = _checked_name(f"seconds_{stage}")
     start = time.perf_counter()
     yield
@@ -119,13 +119,13 @@ def timed(stage: str) -> Iterator[None]:
 
 
 def stop(reason: str) -> NoReturn:
-    """End the notebook in good order, as complete; `reason` says in full sentences what is left out, why, and what to do."""
+    """End the notebook as complete; `reason` states in full sentences what is left out, why, and what to do."""
     _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, {STOP_METADATA: reason})
     raise _End
 
 
 def format_value(value: float | None) -> str:
-    """A number as a reader wants it: four significant digits, no exponent where none is needed."""
+    """A number as text: four significant digits, no exponent where none is needed."""
     if value is None:
         return "n/a"
     if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e7):
@@ -134,7 +134,7 @@ def format_value(value: float | None) -> str:
 
 
 def with_unit(value: float | None, unit: str) -> str:
-    """A number and its unit as a reader expects them; micrometres are "um" in text, tables and figures alike.
+    """A number and its unit as text; micrometres are "um" in text, tables and figures alike.
 
     >>> with_unit(12.3456, "um"), with_unit(2.0, "px^2"), with_unit(None, "")
     ('12.35 um', '2 px²', 'n/a')

@@ -1,6 +1,6 @@
 """Recorded results: tables that ship in ``data/results``, made by studies and read by notebooks.
 
-A table is ``NAME.csv`` (a row a run; units stand in the names of the columns) and its provenance, ``NAME.json``.
+A table is ``NAME.csv`` (one row for each run; columns are named with their units) and its provenance, ``NAME.json``.
 """
 
 import csv
@@ -22,10 +22,10 @@ from lib.provenance import plain
 
 @dataclass(frozen=True)
 class Table:
-    """Rows with the same named columns, and where they come from.
+    """Rows with the same named columns, and their provenance.
 
     Attributes:
-        rows: One dict a row: numbers, truth values, texts; NaN where a number is missing.
+        rows: One dict for each row: numbers, truth values, texts; NaN where a number is missing.
         provenance: Command, commit, machine and date of the runs; empty if unknown.
 
     >>> table = Table([{"noise_px": 0.5, "error_um": 12.0}, {"noise_px": 1.0, "error_um": 24.0}])
@@ -79,9 +79,9 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
 
 
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:
-    """Write the table `name`: one mapping a row (None and NaN become empty entries, numbers keep six digits).
+    """Write the table `name`: one mapping for each row (None and NaN become empty entries, numbers keep six digits).
 
-    `provenance` is as `Provenance.so_far` gives it; the record adds how often it was made, and so its test set was opened.
+    `provenance` is that of `Provenance.so_far`.  The record adds how often it was made, and so its test set was used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = read(name, folder)
@@ -91,14 +91,14 @@ def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path 
 
 
 def csv_text(rows: Iterable[Mapping]) -> str:
-    """Rows as CSV; the columns stand in the order in which they first appear.
+    """Rows as CSV; the columns are in the order in which they first appear.
 
     >>> print(csv_text([{"seed": 0, "error_um": 1 / 3}, {"seed": 1, "error_um": None}]), end="")
     seed,error_um
     0,0.333333
     1,
     """
-    # As `plain` has it, but with infinity, for which CSV has a word.
+    # As `plain` does it, but infinity stays, since CSV can represent it.
     rows = [{k: v if isinstance(v, float) and math.isinf(v) else plain(v) for k, v in row.items()} for row in rows]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
@@ -108,7 +108,7 @@ def csv_text(rows: Iterable[Mapping]) -> str:
 
 
 def _typed(texts: Sequence[str]) -> list:
-    """The entries of a column as the narrowest type that reads all of them; NaN for an empty one of a column of numbers."""
+    """Convert a column to the narrowest type that fits all its entries; an empty entry among numbers becomes NaN."""
     for kind in ({"True": True, "False": False}.__getitem__, int, lambda text: float(text or math.nan)):
         with suppress(KeyError, ValueError):
             return [kind(text) for text in texts]

@@ -1,6 +1,6 @@
-"""``python3 -m lib sweep``: one notebook over a grid of parameters, on Dask, into a table and a plot a metric.
+"""``python3 -m lib sweep``: runs one notebook over a grid of parameters, on Dask; makes a table, and a plot of each metric.
 
-Each point of the grid is one run of the notebook, each run one row of the table.
+Each point of the grid is one run of the notebook, and each run is one row of the table.
 """
 
 import argparse
@@ -37,11 +37,11 @@ def main(argv: Sequence[str]) -> int:
     add("-p", dest="grid", nargs=2, action="append", default=[], metavar=("NAME", "VALUE,VALUE,..."),
         help="a parameter and its values (default: the grid in the comments of the parameters)")  # fmt: skip
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, metavar="N", help="runs at a time on this machine (default: one a core)")
+    where.add_argument("--workers", type=int, metavar="N", help="parallel runs on this machine (default: one per core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://10.0.0.1:8786")
     add("--record", action="store_true", help="also write data/results/NOTEBOOK.csv and .json")
     add("--cell-timeout", dest="cell_timeout_s", type=execution.positive, metavar="S", help="longest time of one cell")
-    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where sweeps/ appears")
+    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="folder for sweeps/")
     options = parser.parse_args(argv)
     if options.workers is not None and options.workers < 1:
         parser.error("--workers: at least 1.")
@@ -58,14 +58,14 @@ def sweep(
     record: bool = False, cell_timeout_s: float | None = None, runs: Path = paths.RUNS,
     notebooks: Path = paths.NOTEBOOKS, recorded: Path = paths.RESULTS,
 ) -> tuple[Path, dict[str, str]]:  # fmt: skip
-    """Execute a notebook at every point of a grid; runs that the same notebook and code finished before are kept.
+    """Execute a notebook at every point of a grid; earlier runs of the same notebook and code are kept.
 
     Args:
-        grid: Values as texts for each parameter; none takes the grid that the notebook declares.
+        grid: Values as texts for each parameter; None is the grid that the notebook declares.
         workers, scheduler: As in `lib.parallel.run_jobs`.
         record: Also write the table to the folder `recorded`, if no run failed and each stated a number.
 
-    Returns ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
+    Returns the path of ``results.csv`` (each row: a run's parameters, then its metrics), and the failure at each point.
     """
     book, *more = execution.choose_notebooks([name], notebooks)
     grid = grid or execution.declared_grid(book)
@@ -85,7 +85,7 @@ def sweep(
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     for executed in [executed for executed, row in rows.items() if row == of_file[executed]]:
         del rows[executed]
-        executed.unlink()  # it stated no number; what it lacked may be at hand now
+        executed.unlink()  # it stated no number and runs again, since missing data may be available now
     failures: dict[str, str] = {}
     table = folder / "results.csv"
     for executed, error in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
@@ -108,10 +108,10 @@ def sweep(
 
 
 def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) -> None:
-    """Write ``METRIC.png`` for each column of numbers that is no parameter.
+    """Write ``METRIC.png`` for each column of numbers that is not a parameter.
 
-    The horizontal axis is the first parameter with several values; the others but `seed` make lines.  A line joins
-    medians over what is left, such as seeds; dots are the runs.
+    The horizontal axis is the first parameter with several values.  There is a line for each combination of the others
+    except `seed`.  It joins the medians over the remaining runs, such as seeds; dots are single runs.
     """
     varied = [name for name in parameters if len({str(row[name]) for row in rows}) > 1]
     axis = next((name for name in varied if name != "seed"), "seed" if "seed" in varied else None)
@@ -141,10 +141,10 @@ def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) ->
 
 
 def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | None) -> None:
-    """In a worker: one run of the notebook into `executed`; or a failed notebook beside it, and an error for the log."""
+    """Run the notebook in a worker, into `executed`; a failure leaves the notebook beside it and raises a RuntimeError."""
     log, failed = executed.with_suffix(".log"), executed.with_suffix(".failed.ipynb")
     with files.whole(executed) as partial:
-        # A context of its own: Jupyter keeps its event loop there, and two threads cannot run the same one.
+        # In a separate context, since Jupyter keeps its event loop there and two threads cannot run the same one.
         failure = contextvars.Context().run(execution.execute, book, partial, values, cell_timeout_s=cell_timeout_s)
         if failure:
             text = [str(failure)]
@@ -156,12 +156,12 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
         notebook = nbformat.read(partial, as_version=4)
         notebook.metadata["microstereo"] = {"machine": machine()}
         nbformat.write(notebook, partial)
-    for left in (log, failed, *executed.parent.glob(f"{executed.stem}.*.partial.ipynb")):  # of attempts before
+    for left in (log, failed, *executed.parent.glob(f"{executed.stem}.*.partial.ipynb")):  # of earlier attempts
         left.unlink(missing_ok=True)
 
 
 def column_name(metric: str, unit: str) -> str:
-    """The column of a metric: its name, which ends in its unit.
+    """The column of a metric: its name, with its unit at the end.
 
     >>> column_name("depth_error", "um"), column_name("depth_error_um", "um"), column_name("pck_0.05", "%")
     ('depth_error_um', 'depth_error_um', 'pck_0.05_percent')
@@ -175,7 +175,7 @@ def _row(executed: Path, point: dict) -> dict:
 
 
 def _cost(executed: Iterable[Path]) -> dict:
-    """What all runs of a table took, also those of an earlier call, and the machines that ran them."""
+    """The time that all runs of a table took, including those of earlier calls, and the machines that ran them."""
     kept = [nbformat.read(path, as_version=4).metadata for path in executed]
     machines = {json.dumps(metadata.microstereo.machine): metadata.microstereo.machine for metadata in kept}
     where = machines.popitem()[1] if len(machines) == 1 else list(machines.values())
@@ -184,7 +184,7 @@ def _cost(executed: Iterable[Path]) -> dict:
 
 
 def _code_digest(book: Path) -> str:
-    """Names what decides the rows: the notebook, its neighbours' helpers, lib and the weights that ship."""
+    """Digest of all that determines the rows: the notebook, the helpers beside it, lib and the weights that ship."""
     code = [*book.parent.glob("*.py"), *(paths.ROOT / "lib").rglob("*.py"), *paths.MODELS.glob("*.safetensors")]
     return files.digest(book, *sorted(code), length=8)
 

@@ -336,7 +336,7 @@ def test_a_clock_beyond_its_search_is_refused_with_the_search_and_the_cure(late_
     mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
     zero = int(late.robot_s[0]) if late_s > 1e6 else 0
     text = f"^robot.offset_s, searched from {zero - 0.5:.3f} to {zero + 0.5:.3f} s: the search ends at its upper edge; "
-    cure = "widen robot.search_s. Or state a number, where t_robot = t_video + offset_s."
+    cure = "widen robot.search_s. Or give a number: t_robot = t_video + offset_s."
     with pytest.raises(ValueError, match=f"{text}{cure}$".replace(".", r"\.").replace("+", r"\+")):
         import_recording(folder, mapping, tmp_path / "eye")
 

@@ -225,7 +225,7 @@ SPOILT = {
         r"log\.csv: its times \(.*frames \(.*\) do not overlap\. "
         r"Set robot\.offset_s \(now 500\.0\) in .*map\.toml to a number from -?\d.*overlap \(.*\)\.$"),
     "a dated log": (edit("log.csv", lambda t: re.sub(r"(?m)^-?[\d.]+", lambda m: f"{1.7e9 + float(m[0]):.3f}", t)),
-        r"log\.csv: its times \(1.*do not overlap.*map\.toml .*or say \"estimate\" where log and video"),
+        r"log\.csv: its times \(1.*do not overlap.*map\.toml .*or to \"estimate\" if log and video"),
     "an image of 16 bits among others": (images(lambda f: cv2.imwrite(
         str(f / "left/003.png"), np.full((134, 240), 1900, np.uint16))),
         r"left/\d+\.png: 16-bit values up to 1900, and no bit_depth is stated\. .*video\.bit_depth in an import's mapping"),
@@ -266,7 +266,7 @@ SPOILT = {
     "degrees called radians": (pose(old='gripper_unit = "deg"', new='gripper_unit = "rad"'),
         r"pose\.tsv: the gripper opens to .* gripper_unit"),
     "no tool geometry": (pose(tool=""),
-        r"the place of base, tip_1, tip_2 in the tool frame is open; give tool\.landmarks_mm"),
+        r"the position of base, tip_1, tip_2 in the tool frame is not given; give tool\.landmarks_mm"),
     "a jaw along its hinge": (pose(tool=HINGE.replace("axis = [0, 0, 1]", "axis = [1, 0, 0]")),
         r"the jaw lies along the axis"),
     "jaws that never open": (shut, r"the jaws open by only 0 rad, which does not determine the hinge"),

@@ -304,7 +304,7 @@ SPOILERS = {
     "half a landmark": (
         lambda f: edit(f / "kinematics.csv", ",4.000000", ","),
         ValueError,
-        "line 2: a landmark has some",
+        "line 2: a landmark lacks some",
     ),
     "text kinematics": (
         lambda f: edit(f / "kinematics.csv", "0.0100000", "soon"),
@@ -321,12 +321,13 @@ SPOILERS = {
     "semicolons": (
         lambda f: (f / "kinematics.csv").write_text((f / "kinematics.csv").read_text().replace(",", ";")),
         ValueError,
-        r"kinematics\.csv, line 1: semicolons part its cells\. Save it with commas between cells and points in numbers\.$",
+        r"kinematics\.csv, line 1: semicolons separate its cells\. "
+        r"Save it with commas between cells and points in numbers\.$",
     ),
     "tabs": (
         lambda f: (f / "frames.csv").write_text("frame\ttime_s\n0\t0\n1\t0.04\n"),
         ValueError,
-        r"frames\.csv, line 1: tabs part its cells",
+        r"frames\.csv, line 1: tabs separate its cells",
     ),
     "no kinematic rows": (
         lambda f: (f / "kinematics.csv").write_text((f / "kinematics.csv").read_text().splitlines()[0] + "\n"),

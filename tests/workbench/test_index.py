@@ -126,7 +126,7 @@ def test_a_recording_without_truth_shows_only_what_needs_none():
         "registration_error_3_frames_um", "pipeline_rate_hz", "calibration_reprojection_px", "landmark_seen_share",
     ]  # fmt: skip
     assert not any(row["recorded"] for row in rows) and rows[-1]["light"] == "met"
-    assert len(left_out) == 5 and "no truth that judges" in index_html(run)
+    assert len(left_out) == 5 and "no truth, so these numbers are not shown" in index_html(run)
 
 
 def test_the_previous_run_is_of_this_machine_profile_and_parameters(tmp_path):

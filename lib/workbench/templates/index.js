@@ -1,4 +1,4 @@
-// Shows the rows of the table of all numbers that hold every word that is typed.
+// Shows only those rows of the table of all numbers that contain every typed word.
 const rows = [...document.querySelectorAll("#all tbody tr")].map((row) => [row, row.textContent.replaceAll("\u00ad", "").toLowerCase()]);
 document.getElementById("find").addEventListener("input", (event) => {
   const words = event.target.value.toLowerCase().split(/\s+/).filter(Boolean);

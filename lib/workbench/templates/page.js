@@ -1,7 +1,7 @@
-// What moves in a page: views in three dimensions, pictures with controls, and the table of contents on a small screen.
+// The interactive parts of a page: 3D views, pictures with controls, and the table of contents on a small screen.
 for (const view of document.querySelectorAll(".plotly-view")) {
   const figure = JSON.parse(view.nextElementSibling.textContent);
-  const eye = figure.layout.scene?.camera?.eye ?? {};  // its height fixes the scale: a narrow view steps back
+  const eye = figure.layout.scene?.camera?.eye ?? {};  // the height sets the scale, so a narrow view needs more distance
   if (view.clientWidth < 620) Object.keys(eye).forEach((axis) => { eye[axis] *= 1.6; });
   Plotly.newPlot(view, figure.data, figure.layout, { responsive: true, displaylogo: false });
 }
