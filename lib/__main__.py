@@ -1,4 +1,4 @@
-"""The command line: ``python3 -m lib COMMAND``.  Runs on a bare Python and moves on into ``.venv``."""
+"""The command line: ``python3 -m lib COMMAND``.  Starts on a bare Python, then continues with the Python of ``.venv``."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 USAGE = (ROOT / "lib" / "usage.txt").read_text(encoding="utf-8")
 
-#: Oldest and first unsupported Python; environment.toml says the same to other tools.
+#: Oldest supported and first unsupported Python; environment.toml states the same for other tools.
 PYTHONS = ((3, 11), (3, 15))
 
 
 def main(argv: list[str]) -> int:
-    """Find a fitting Python and environment, then dispatch; returns the exit code."""
+    """Find a supported Python, set up the environment, and run the command; returns the exit code."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(f"usage: {USAGE}")
         return 0 if argv else 2
@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
         print(f"\n{problem}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("\nStopped. Start again; a half-made environment is repaired.", file=sys.stderr)
+        print("\nStopped. Start again; an incomplete environment is repaired.", file=sys.stderr)
         return 130
     if argv[0] == "setup":
         return 0
@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
 def _use_another_python(argv: list[str]) -> int:
     for minor in range(PYTHONS[1][1] - 1, PYTHONS[0][1] - 1, -1):
         python = shutil.which(f"python3.{minor}")
-        if python and not subprocess.run([python, "-c", ""], capture_output=True).returncode:  # no stub of a version manager
+        if python and not subprocess.run([python, "-c", ""], capture_output=True).returncode:  # not a version manager's stub
             return _become([python, "-m", "lib", *argv])
     wanted = f"3.{PYTHONS[0][1]} to 3.{PYTHONS[1][1] - 1}"
     print(f"microstereo needs Python {wanted}; this is {sys.version.split()[0]}.", file=sys.stderr)
@@ -65,7 +65,7 @@ def _use_another_python(argv: list[str]) -> int:
 
 
 def _become(command: list[str]) -> int:
-    """Go on as another process (on Windows, which cannot, as a child)."""
+    """Replace this process by `command`; on Windows, which cannot do that, run it as a child process."""
     if os.name == "nt":
         return subprocess.call(command)
     sys.stdout.flush()
@@ -73,41 +73,41 @@ def _become(command: list[str]) -> int:
 
 
 def test(argv: list[str]) -> int:
-    """Style, then the tests; `argv` goes to pytest."""
+    """Check the style, then run the tests; `argv` goes to pytest."""
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
     plugins = ["-p", "xdist", "-p", "hypothesispytest"]
     return _pytest([*plugins, "--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:
-    """The timings of tests/benchmarks."""
+    """Run the benchmarks in tests/benchmarks."""
     plain = ["--override-ini=addopts=--import-mode=importlib --strict-markers", "-p", "benchmark"]
     return _pytest([*plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
 
 
 def lab(argv: list[str]) -> int:
-    """JupyterLab in this environment."""
+    """Open JupyterLab in this environment."""
     root = ["--allow-root"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    page = [] if "LabApp.default_url" in " ".join(argv) else ["--LabApp.default_url=/lab/tree/notebooks"]  # it takes but one
+    page = [] if "LabApp.default_url" in " ".join(argv) else ["--LabApp.default_url=/lab/tree/notebooks"]  # it takes only one
     return _become([sys.executable, "-m", "jupyterlab", f"--notebook-dir={ROOT}", *page, *root, *argv])
 
 
 def _pytest(argv: list[str]) -> int:
-    keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays take memory that is at hand
-    keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # every package's plugin takes time to load
+    keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays reuse freed memory
+    keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # loading every installed plugin takes time
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
     return subprocess.call(command, env=keep | os.environ)
 
 
 def _call(name: str, argv: list[str]) -> int:
-    """The command `name` of `FUNCTIONS`.  An error that a user can mend is told in one line, without a traceback."""
+    """Run the command `name` of `FUNCTIONS`.  Errors that a user can fix are printed in one line, without a traceback."""
     module, function = FUNCTIONS[name]
     usual = warnings.formatwarning
-    warnings.formatwarning = lambda message, kind, *place, **line: (  # a user has no use for the line of code
+    warnings.formatwarning = lambda message, kind, *place, **line: (  # the line of code does not help a user
         f"Warning: {message}\n" if kind is UserWarning else usual(message, kind, *place, **line)
     )
     try:
-        if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
+        if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # these detect landmarks in a recording
             _keep_detections()
         return getattr(importlib.import_module(module), function)(argv)
     except KeyboardInterrupt:
@@ -119,24 +119,24 @@ def _call(name: str, argv: list[str]) -> int:
 
 
 def _keep_detections() -> None:
-    """Name the folder in which `SharedDetector` keeps what one command detects for the next; other code has another one."""
+    """Name the folder in which `SharedDetector` keeps detections for later commands; other detector code has its own."""
     from lib import files, paths
 
     folder = paths.CACHE / "detections" / files.digest(*sorted((ROOT / "lib" / "landmarks").glob("*.py")))
-    with contextlib.suppress(OSError):  # on a full disk each command detects for itself
+    with contextlib.suppress(OSError):  # on a full disk detections are not kept
         folder.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault(paths.SHARED_VARIABLE, str(folder))
 
 
 def ruff_options() -> list[str]:
-    """[tool.ruff] of environment.toml as command-line options (ruff reads only files of its own names)."""
+    """[tool.ruff] of environment.toml as command-line options, since ruff only reads files with certain names."""
     from lib.environment import manifest
     from lib.files import toml_entries
 
     return ["--isolated", *(f"--config={entry}" for entry in toml_entries(manifest()["tool"]["ruff"]))]
 
 
-#: Command -> the function that it calls, and its module.
+#: Command -> module and name of the function that it calls.
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
     "site": ("lib.workbench.command", "main_site"),

@@ -1,8 +1,8 @@
 """Affine and near-affine cameras, and the calibrated stereo pair: projection, epipolar geometry, triangulation.
 
-An affine camera maps a point x (mm, robot frame unless said otherwise) to the pixel u = M [x; 1] with M (2, 4)
-(paper Sec. IV-A).  Two of them stack to y = A x + t with y = (u_left, u_right), A (4, 3): four numbers that hold a 3D
-point and one epipolar residual, so triangulation is one small constant matrix.
+An affine camera maps a point x (mm, robot frame unless stated otherwise) to the pixel u = M [x; 1] with M (2, 4)
+(paper Sec. IV-A).  Two cameras together give y = A x + t with y = (u_left, u_right), A (4, 3).  These four numbers
+determine a 3D point and one epipolar residual, so triangulation is a product with one small constant matrix.
 """
 
 import json
@@ -20,19 +20,19 @@ from lib.geometry import RigidTransform, cross, pair_covariance, points, store_a
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
-#: Points at a time: few enough for their arrays to stay in the processor's cache.
+#: Number of points processed at once: their arrays stay in the processor's cache.
 _BLOCK = 8192
 
 
 @dataclass(frozen=True)
 class Resection:
-    """M = K [r1 t1; r2 t2] (paper Eq. 5): intrinsics and pose, all but the shift along the optical axis.
+    """M = K [r1 t1; r2 t2] (paper Eq. 5): intrinsics and pose, except for the shift along the optical axis.
 
     Attributes:
         K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
         R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
         t: (2,) mm, so that u = K (R[:2] @ x + t).
-        mirrored: As the caller said: one affine camera alone cannot tell (a reflection only flips R's unseen third row).
+        mirrored: As given by the caller; a single affine camera does not show it (a reflection only flips R's third row).
     """
 
     K: np.ndarray
@@ -43,7 +43,7 @@ class Resection:
 
 @runtime_checkable
 class Camera(Protocol):
-    """Anything that projects points."""
+    """Any object that projects points."""
 
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm."""
@@ -51,9 +51,9 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MatrixCamera:
-    """What our cameras share: the matrix (2, 4), px per mm and px, of the affine camera that it is or that touches it.
+    """Base class of cameras: the matrix (2, 4), px per mm and px, of the affine camera or affine approximation.
 
-    A model adds `project`, `jacobian` and `projection_matrix`.  A ValueError refuses a matrix that is not finite or whose
+    Subclasses add `project`, `jacobian` and `projection_matrix`.  A ValueError refuses a matrix that is not finite or whose
     linear part has rank below 2.
     """
 
@@ -62,7 +62,7 @@ class MatrixCamera:
     def __post_init__(self) -> None:
         store_array(self, "matrix", (2, 4))
         if np.linalg.svd(self.linear, compute_uv=False)[1] <= 1e-9 * np.abs(self.linear).max():
-            raise ValueError("matrix: its linear part has rank below 2, so it sees a line, not a plane.")
+            raise ValueError("matrix: its linear part has rank below 2, so its image is a line, not a plane.")
 
     @property
     def linear(self) -> np.ndarray:
@@ -76,12 +76,12 @@ class MatrixCamera:
 
     @cached_property
     def viewing_direction(self) -> np.ndarray:
-        """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
+        """Unit vector (3,) along which `matrix` projects points to the same pixel, away from the (unmirrored) camera."""
         direction = cross(*self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:
-        """The camera after a rigid motion of itself: it sees motion.apply(x) where it saw x.
+        """The camera after a rigid motion: it images motion.apply(x) where it imaged x before.
 
         >>> camera = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
         >>> camera.moved(RigidTransform(np.eye(3), [1, 0, 0])).project([1, 0, 0]).tolist()
@@ -91,12 +91,12 @@ class MatrixCamera:
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
 
     def resect(self, *, mirrored: bool = False) -> Resection:
-        """K, R and t by RQ factorisation (paper Eq. 5), of a near-affine camera those of `matrix`.
+        """K, R and t by RQ factorisation of `matrix` (paper Eq. 5), also for a near-affine camera.
 
         With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
         whose third axis still points away from the camera.
         """
-        K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
+        K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), up to signs
         signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
         K, R = K * signs, R * signs[:, None]
         return Resection(K, np.vstack([R, cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
@@ -110,7 +110,7 @@ class AffineCamera(MatrixCamera):
         return points(x, 3, "x") @ self.linear.T + self.offset_px
 
     def jacobian(self, x: ArrayLike) -> np.ndarray:
-        """Derivative of `project`, (n, 2, 3) px per mm; the same at every point."""
+        """Derivative of `project`, (n, 2, 3) px per mm; it is the same at every point."""
         return np.broadcast_to(self.linear, (len(points(x, 3, "x")), 2, 3))
 
     @property
@@ -121,19 +121,19 @@ class AffineCamera(MatrixCamera):
 
 @dataclass(frozen=True, eq=False)
 class NearAffineCamera(MatrixCamera):
-    """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / D.
+    """A camera at a finite working distance d, one parameter more than affine: u = c + (M [x; 1] - c) / D.
 
-    D = 1 + r3.(x - reference) / d.  Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where
-    perspective resection is ill-conditioned.  r3 is the viewing direction of M, away from the camera; d is the
-    distance along r3 from the camera to the plane through the reference point.  A mirrored image shows as a
-    negative 1/d, since reflection turns the direction r3 that M implies round.
+    D = 1 + r3.(x - reference) / d.  The affine camera is 1/d = 0, a regular point of the model, so 1/d can be estimated
+    and tested even where perspective resection is ill-conditioned.  r3 is the viewing direction of M, away from the
+    camera; d is the distance along r3 from the camera to the plane through the reference point.  A mirrored image has a
+    negative 1/d, since a reflection reverses the direction r3 that follows from M.
 
     Attributes:
-        matrix: M (2, 4), the affine camera that touches this one in the plane r3.(x - reference) = 0.
+        matrix: M (2, 4), the affine camera that equals this one in the plane r3.(x - reference) = 0.
         inverse_distance_per_mm: 1/d.
         centre_px: c, the principal point (2,), towards which distant points shrink.
-        reference_mm: A point (3,) of the plane where the two touch; the origin unless given.
-        radial_per_px2: k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
+        reference_mm: A point (3,) of that plane; the origin unless given.
+        radial_per_px2: k of radial distortion about c: the pixel u above moves by k |u - c|^2 (u - c).
     """
 
     inverse_distance_per_mm: float
@@ -151,11 +151,11 @@ class NearAffineCamera(MatrixCamera):
             object.__setattr__(self, name, float(getattr(self, name)))
 
     def depth_ratio(self, x: np.ndarray) -> np.ndarray:
-        """D (n,) of points (n, 3) mm: distance along the view over d; zero or less behind the camera."""
+        """D (n,) of points (n, 3) mm: distance from the camera along the view, divided by d; at most 0 behind the camera."""
         return 1.0 + self.inverse_distance_per_mm * ((x - self.reference_mm) @ self.viewing_direction)
 
     def _undistorted(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (n, 2) relative to the centre and before distortion, and D (n, 1)."""
+        """Undistorted pixels (n, 2) relative to the centre, and D (n, 1)."""
         x = points(x, 3, "x")
         ratio = self.depth_ratio(x)[:, None]
         if (ratio <= 0).any():
@@ -174,9 +174,9 @@ class NearAffineCamera(MatrixCamera):
         return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
 
     def undistort(self, u: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) with the radial distortion taken out.
+        """Pixels (n, 2) with the radial distortion removed.
 
-        Barrel distortion (k < 0) folds the image over at a largest radius; pixels beyond, which it shows nowhere, become NaN.
+        Barrel distortion (k < 0) has a largest distorted radius; pixels beyond it, where no point is imaged, become NaN.
 
         >>> camera = NearAffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]], 0.01, [0, 0], radial_per_px2=-1e-6)
         >>> camera.undistort([[0, 351], [0, 400]]).round().tolist()
@@ -187,21 +187,21 @@ class NearAffineCamera(MatrixCamera):
             return u
         w = u - self.centre_px
         distorted, size = np.linalg.norm(w, axis=1), 2 / np.sqrt(3 * abs(self.radial_per_px2))
-        # The cubic equation for the radius is that for the sine, or the hyperbolic sine, of a third of an angle.
+        # Solve the cubic equation for the radius by the triple-angle formula of the sine (k < 0) or hyperbolic sine.
         sine, angle = (np.sin, np.arcsin) if self.radial_per_px2 < 0 else (np.sinh, np.arcsinh)
-        with np.errstate(invalid="ignore"):  # of what is beyond
+        with np.errstate(invalid="ignore"):  # pixels beyond the largest radius
             radius = size * sine(angle(3 * distorted / size) / 3)
         return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted != 0)[:, None]
 
     @property
     def projection_matrix(self) -> np.ndarray:
-        """Homogeneous P (3, 4) of the camera without its radial distortion; it is 1 in the reference plane."""
+        """Homogeneous P (3, 4) without radial distortion; the third homogeneous coordinate is 1 in the reference plane."""
         last = self.inverse_distance_per_mm * np.append(self.viewing_direction, 0.0)
         last[3] = 1.0 - last[:3] @ self.reference_mm
         return np.vstack([self.matrix + np.outer(self.centre_px, last - [0, 0, 0, 1]), last])
 
     def moved(self, motion: RigidTransform) -> Self:
-        """As of an affine camera, and the reference point moves along."""
+        """The camera after a rigid motion, as for an affine camera; the reference point moves with it."""
         return replace(super().moved(motion), reference_mm=motion.apply(self.reference_mm))
 
 
@@ -222,7 +222,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two calibrated cameras that share the frame of their points (the robot's, unless a name says otherwise).
+    """Two calibrated cameras with a common frame of their points (the robot's, unless a name says otherwise).
 
     >>> left = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
     >>> right = AffineCamera([[100, 0, 11, 960], [0, 100, 0, 540]])
@@ -237,7 +237,7 @@ class StereoRig:
 
     @cached_property
     def is_affine(self) -> bool:
-        """True where both cameras are affine, so that every formula below is one constant matrix."""
+        """True if both cameras are affine, so that projection and triangulation are constant matrices."""
         return isinstance(self.left, AffineCamera) and isinstance(self.right, AffineCamera)
 
     @cached_property
@@ -258,9 +258,9 @@ class StereoRig:
 
     @property
     def fundamental(self) -> np.ndarray:
-        """Fundamental matrix F (3, 3), [u_right; 1].F.[u_left; 1] = 0; of an affine pair scaled so that its value is px.
+        """Fundamental matrix F (3, 3), [u_right; 1].F.[u_left; 1] = 0; for an affine pair this product is in px.
 
-        Of near-affine cameras it holds for undistorted pixels and has unit Frobenius norm.
+        For near-affine cameras it refers to undistorted pixels and has unit Frobenius norm.
         """
         if not self.is_affine:
             P, Q = self.left.projection_matrix, self.right.projection_matrix
@@ -271,7 +271,7 @@ class StereoRig:
         return np.array([[0.0, 0.0, n[2]], [0.0, 0.0, n[3]], [n[0], n[1], e]])
 
     def moved(self, left: RigidTransform, right: RigidTransform | None = None) -> Self:
-        """The rig after its cameras moved in the frame of their points, both alike or each by its own motion."""
+        """The rig after its cameras moved in the frame of their points, together or each by its own motion."""
         return StereoRig(self.left.moved(left), self.right.moved(left if right is None else right))
 
     @cached_property
@@ -281,7 +281,7 @@ class StereoRig:
 
     @cached_property
     def sees_depth(self) -> bool:
-        """False where both cameras look along the same line: how deep a point lies moves no pixel."""
+        """False if both viewing directions are parallel, so that the depth of a point changes no pixel."""
         return bool(np.linalg.norm(self.right.linear @ self.left.viewing_direction) > 1e-6 * np.linalg.norm(self.linear))
 
     def project(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -293,19 +293,19 @@ class StereoRig:
         return np.concatenate([self.left.jacobian(x), self.right.jacobian(x)], axis=1)
 
     def epipolar_distance(self, u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
-        """Signed distance (n,) px of each match from the epipolar constraint.
+        """Signed epipolar distance (n,) px of each match.
 
-        The distance is in the four pixel coordinates together, so independent noise of 1 px in each gives a
-        distance of standard deviation 1 px (Hartley and Zisserman, Sec. 14.4).
+        It is the distance in the space of the four pixel coordinates, so independent noise of 1 px in each gives a
+        standard deviation of 1 px (Hartley and Zisserman, Sec. 14.4).
         """
         return self.triangulate(u_left, u_right).epipolar_px
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
-        """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
+        """Maximum-likelihood points from matches (n, 2) px, with the covariance that follows from the noise of the matches.
 
-        A row gives a NaN point with a NaN covariance where it is NaN, where no point in front of near-affine cameras explains
-        it, and where affine cameras see no depth.  `covariance_px2` of the matches has any form that
-        `lib.geometry.pair_covariance` takes; None is 1 px^2.
+        Point and covariance are NaN if the row is NaN, if no point in front of near-affine cameras explains it, or if affine
+        cameras see no depth.  `covariance_px2` of the matches has any form that `lib.geometry.pair_covariance` accepts;
+        None is 1 px^2.
         """
         u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
         if len(u_left) != len(u_right):
@@ -322,7 +322,7 @@ class StereoRig:
         return Points(x, np.broadcast_to(covariance_mm2, (len(x), 3, 3)), self.epipolar_normal @ y)
 
     def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray) -> Points:
-        """Linear for each point (the projection's denominator multiplied out), then two Gauss-Newton steps on the pixels."""
+        """A linear solution (the projection times its denominator), then two Gauss-Newton steps on the reprojection error."""
         x, covariance_mm2, epipolar = (np.full((len(y), *shape), np.nan) for shape in ((3,), (3, 3), ()))
         known = np.flatnonzero(np.isfinite(y).all(axis=1))
         near = [camera for camera in (self.left, self.right) if isinstance(camera, NearAffineCamera)]
@@ -336,21 +336,21 @@ class StereoRig:
             linear = np.concatenate(equations, axis=1)
             found = _least_squares(linear[:, :, :3], -linear[:, :, 3], np.eye(4))[0]
             step, seen = 0.0, np.ones(len(rows), dtype=bool)
-            for _ in range(3):  # the last time for the covariance at the point found
+            for _ in range(3):  # the third time gives the covariance at the result
                 found = found + step
                 in_front = np.all([camera.depth_ratio(found) > 0 for camera in near], axis=0)
-                safe = np.where(in_front[:, None], found, near[0].reference_mm)  # the others stand at the centre
+                safe = np.where(in_front[:, None], found, near[0].reference_mm)  # placeholder for the others
                 J, r = self.jacobian(safe), y[rows] - np.hstack(self.project(safe))
                 step, inverse = _least_squares(J, r, W)
                 seen &= in_front
-            # What no point explains, along the epipolar normal; that of the affine cameras says its sign.
-            off = r - (J @ _least_squares(J, r, np.eye(4))[0][:, :, None])[:, :, 0]
-            off = np.sign(off @ self.epipolar_normal) * np.linalg.norm(off, axis=1)
-            x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], off[seen]
+            # Epipolar distance: the part of r that no change of the point explains, signed by the affine epipolar normal.
+            rest = r - (J @ _least_squares(J, r, np.eye(4))[0][:, :, None])[:, :, 0]
+            rest = np.sign(rest @ self.epipolar_normal) * np.linalg.norm(rest, axis=1)
+            x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], rest[seen]
         return Points(x, covariance_mm2, epipolar)
 
     def save(self, path: str | Path) -> None:
-        """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
+        """Write the rig as JSON (matrices, units); the file is never left incomplete."""
         content = {"format": FORMAT, "units": UNITS}
         for side, camera in (("left", self.left), ("right", self.right)):
             content[side] = {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
@@ -358,7 +358,7 @@ class StereoRig:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote; a FileNotFoundError or ValueError names the file, also of a rig that sees no depth."""
+        """Read a file of `save`.  A FileNotFoundError or ValueError names the file; a rig that sees no depth is refused."""
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; StereoRig.save writes one.")
@@ -378,9 +378,9 @@ class StereoRig:
 
 
 def _least_squares(J: np.ndarray, r: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix; NaN where it has none."""
+    """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix; NaN if it is singular."""
     WJ = W @ J
     normal = J.mT @ WJ
-    with np.errstate(invalid="ignore"):  # of NaN
+    with np.errstate(invalid="ignore"):  # rows with NaN
         inverse = np.linalg.inv(np.where(np.linalg.det(normal)[:, None, None] == 0, np.nan, normal))
     return (inverse @ (WJ.mT @ r[..., None]))[..., 0], inverse

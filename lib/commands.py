@@ -1,7 +1,7 @@
-"""``python3 -m lib import | detect | calibrate | reconstruct | register``: the stages for who does not write Python.
+"""``python3 -m lib import | detect | calibrate | reconstruct | register``: the stages for users who do not write Python.
 
-Each prints what it did and ends on the verdict of `lib.trust`.  Exit codes: 0; 2 bad input, nothing written; 3 the verdict
-is "not trustworthy", so no file that follows from the calibration is written (--force writes it).
+Each prints what it did and ends with the verdict of `lib.trust`.  Exit codes: 0; 2 bad input, nothing written; 3 the
+verdict is "not trustworthy", so no results that depend on the calibration are written (--force writes them).
 """
 
 import argparse
@@ -28,7 +28,7 @@ from lib.registration import register_images
 from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
-#: Fewer landmarks are fitted too well by cameras of their own to be compared with; errors below this say nothing.
+#: Least number of landmarks for comparing a rig with cameras calibrated from them (fewer are overfitted), and least error.
 _FEWEST, _EXACT_PX = 24, 0.5
 
 
@@ -62,11 +62,11 @@ def main_import(argv: list[str]) -> int:
 
 
 def main_annotate(argv: list[str]) -> int:
-    """`python3 -m lib annotate`: label frames by hand in JupyterLab, the most useful first; into annotations.json."""
+    """`python3 -m lib annotate`: label frames by hand in JupyterLab, the most useful first; writes annotations.json."""
     parser = argparse.ArgumentParser(prog="python3 -m lib annotate", description=main_annotate.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording")
     folder = Recording.open(parser.parse_args(argv).recording, truth=False).folder.resolve()
-    page = paths.RUNS / f"annotate-{folder.name}-{files.digest(str(folder).encode(), length=6)}.ipynb"  # one a folder
+    page = paths.RUNS / f"annotate-{folder.name}-{files.digest(str(folder).encode(), length=6)}.ipynb"  # one for each folder
     page.parent.mkdir(exist_ok=True)
     text = json.dumps(json.dumps(str(folder))[1:-1])[1:-1]  # a Python string in JSON
     files.write_text(page, (paths.ROOT / "lib" / "annotate.ipynb").read_text(encoding="utf-8").replace("RECORDING", text))
@@ -85,7 +85,7 @@ def main_detect(argv: list[str]) -> int:
 
 
 def main_calibrate(argv: list[str]) -> int:
-    """`python3 -m lib calibrate`: both cameras from landmarks and the robot; JSON, OpenCV YAML and ROS CameraInfo."""
+    """`python3 -m lib calibrate`: both cameras from landmarks and the robot; writes JSON, OpenCV YAML, ROS CameraInfo."""
     a, recording, out = _parsed("calibrate", main_calibrate, argv)
     calibration, verdict, data = _calibrated(a, recording, out)
     if calibration is None:
@@ -96,11 +96,11 @@ def main_calibrate(argv: list[str]) -> int:
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
-    return _done(a, out, "calibration", numbers | _told(calibration.offsets), verdict)
+    return _done(a, out, "calibration", numbers | _offsets_entries(calibration.offsets), verdict)
 
 
 def main_reconstruct(argv: list[str]) -> int:
-    """`python3 -m lib reconstruct`: the surface that one stereo frame shows; GLB, PLY, a depth map, the rectified pair."""
+    """`python3 -m lib reconstruct`: the surface in one stereo frame; writes GLB, PLY, a depth map, the rectified pair."""
     a, recording, out = _parsed("reconstruct", main_reconstruct, argv)
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
@@ -114,19 +114,19 @@ def main_reconstruct(argv: list[str]) -> int:
         save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
     except ImportError as error:
         print(f"Without surface.glb and points.ply: {error}")
-    (out / "depth.tiff").unlink(missing_ok=True)  # that of an earlier run: without parallel rays there is none
+    (out / "depth.tiff").unlink(missing_ok=True)  # from an earlier run; without parallel rays there is no depth map
     if found.rig.is_affine:
         save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
     _write_rectified(out, found.rig, frame.left, frame.right)
-    found.rig.save(out / "refined_rig.json")  # as the matches refined it
+    found.rig.save(out / "refined_rig.json")  # refined by the matches
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
 
 
 def main_register(argv: list[str]) -> int:
-    """`python3 -m lib register`: where cameras that were calibrated before are now, after the microscope was moved."""
+    """`python3 -m lib register`: find the calibrated cameras again, after the microscope was moved."""
     a, recording, out = _parsed("register", main_register, argv)
-    data, (*_, offsets) = _data(a, recording), _beside(a.rig)
+    data, (*_, offsets) = _data(a, recording), _results_of_rig(a.rig)
     seen = with_offsets(data, offsets)
     found = register_images(StereoRig.load(a.rig), seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
     moved, seen = StereoRig.load(a.rig).moved(found.transform), seen.complete
@@ -134,7 +134,7 @@ def main_register(argv: list[str]) -> int:
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
     medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
     anew = _assessed(a, recording, data)
-    verdict = Verdict.join([_as_one(moved, anew, offsets), anew.verdict])
+    verdict = Verdict.join([_common_motion(moved, anew, offsets), anew.verdict])
     if _refused(a, out, verdict):
         return 3
     _write_rig(out, moved, recording, "moved_")
@@ -145,31 +145,31 @@ def main_register(argv: list[str]) -> int:
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where it is expected (median).")
-    return _done(a, out, "registration", numbers | _told(offsets), verdict)
+    return _done(a, out, "registration", numbers | _offsets_entries(offsets), verdict)
 
 
 def _assessed(a: argparse.Namespace, recording: Recording, data: Correspondences) -> Assessment:
     return assess(recording.showing(a.frames), data, detector=a.detector, **a.options)
 
 
-def _told(offsets: LandmarkOffsets | None) -> dict:
-    """Offsets of the landmarks as result files hold them."""
+def _offsets_entries(offsets: LandmarkOffsets | None) -> dict:
+    """The entries of a result file for the landmarks' offsets."""
     numbers = {"landmark_offsets_mm": offsets and offsets.offset.tolist()}
     return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
-def _beside(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOffsets | None]:
-    """By the results beside a rig: the recording that it is of (and this frame), its verdict, the landmarks' offsets."""
+def _results_of_rig(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOffsets | None]:
+    """From the result file beside a rig: its recording ("" if not of this frame), its verdict, the landmarks' offsets."""
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
     if not path.is_file():
         return "", Verdict(), None
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        offset, turns = told["landmark_offsets_mm"], bool(told["landmark_offsets_turn_axes"])
+        results = json.loads(path.read_text(encoding="utf-8"))
+        offset, turns = results["landmark_offsets_mm"], bool(results["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
-        own = rig.name in ("rig.json", "moved_rig.json") and "recording" in told  # a refined rig is another
-        own = own and frame in range(*told["frames"])
-        folder, verdict = told["recording"] if own else "", Verdict(tuple(Reason(**r) for r in told["reasons"] if own))
+        own = rig.name in ("rig.json", "moved_rig.json") and "recording" in results  # they are not about a refined rig
+        own = own and frame in range(*results["frames"])
+        folder, verdict = results["recording"] if own else "", Verdict(tuple(Reason(**r) for r in results["reasons"] if own))
     except (ValueError, KeyError, TypeError) as error:
         what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
         raise ValueError(f"{what}; calibrate again, or move that file away.") from None
@@ -177,8 +177,8 @@ def _beside(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOffsets | 
     return folder, verdict, None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
 
 
-def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:
-    """Whether one motion of both cameras explains the landmarks about as well as cameras calibrated from them."""
+def _common_motion(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:
+    """Doubts a common motion of both cameras if it explains the landmarks worse than cameras calibrated from them."""
     if found.calibration is None or len(found.data.complete) < _FEWEST:
         return Verdict()
 
@@ -189,7 +189,7 @@ def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None
     now, anew = error_px(moved, offsets), error_px(found.calibration.pair, found.calibration.offsets)
     level = LEVELS[np.searchsorted(LIMITS["residuals"], now / max(anew, _EXACT_PX))]
     text = f"The moved cameras miss the landmarks by {now:.1f} px (median), cameras calibrated from them by {anew:.1f} px."
-    cure = "Did one camera move alone, did zoom or focus change, is --rig of another microscope? Calibrate anew."
+    cure = "Did only one camera move, did zoom or focus change, is --rig of another microscope? Calibrate again."
     return Verdict(() if level == LEVELS[0] else (Reason("no_common_motion", level, text, cure),))
 
 
@@ -200,9 +200,9 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
-    add("--frames", metavar="A:B", help="of the frames from A to before B (default: of all); --frames=-10: takes ten")
-    add("--model", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ... (default: as the data show)")
-    if name != "detect":  # they may be refused
+    add("--frames", metavar="A:B", help="use frames A to B - 1 (default: all); --frames=-10: uses the last ten")
+    add("--model", help="camera model: zero_skew, near_affine (a finite distance), affine, ... (default: chosen by the data)")
+    if name != "detect":  # only these refuse results
         add("--force", action="store_true", help="write results whatever the verdict")
     if name == "reconstruct":
         add("--frame", type=int, help="number of the frame, from 0 (default: the first)")
@@ -211,11 +211,11 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
         add("--rig", type=Path, required=name == "register", help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
     if a.weights and a.landmarks == "annotations":
-        parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
+        parser.error("--weights: with --landmarks annotations no detector is used; leave one of the two out.")
     if name == "reconstruct" and a.rig and (a.model or a.frames):
         parser.error("--model, --frames: with --rig no camera is calibrated; leave them out, or --rig.")
     a.options = {"model": a.model} if a.model else {}
-    Model.parse(a.model or "zero_skew", 2)  # an unknown one is refused
+    Model.parse(a.model or "zero_skew", 2)  # refuses an unknown model
     recording = Recording.open(a.recording)
     some, a.frames = a.frames, recording.frames_of(a.frames or ":")
     if name == "reconstruct":
@@ -223,7 +223,7 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
         if a.frame not in a.frames:
             parser.error(f"--frame: choose one of frames {a.frames[0]} to {a.frames[-1]}.")
     a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
-    part = f"-{a.frames.start}-{a.frames.stop}" if some else ""  # each part has results of its own
+    part = f"-{a.frames.start}-{a.frames.stop}" if some else ""  # each part has its own results
     out = a.out or paths.results_folder(a.recording.resolve().name + part, a.recording)
     out.mkdir(parents=True, exist_ok=True)
     a.earlier = {path: path.lstat().st_mtime_ns for path in out.iterdir()}
@@ -241,21 +241,21 @@ def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None
     if a.landmarks == "annotations":
         return _labelled(recording).of_frames(frames)
     if recording.skeleton != LANDMARKS:
-        told = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
-        raise ValueError(f"{recording.folder}: {told}. Label frames and give --landmarks annotations.")
+        what = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
+        raise ValueError(f"{recording.folder}: {what}. Label frames and give --landmarks annotations.")
     return detect(recording, a.detector, frames=frames)
 
 
 def _calibrated(
     a: argparse.Namespace, recording: Recording, out: Path
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
-    """The calibration of a recording, None where it is refused, or the rig that --rig names; the verdict; the landmarks."""
-    given = getattr(a, "rig", None)  # then only the frame's own landmarks are needed, to mask the tool
+    """The calibration (None if refused) or the rig of --rig; the verdict; the landmarks."""
+    given = getattr(a, "rig", None)  # with a rig, only the frame's landmarks are needed, to mask the tool
     data = _data(a, recording, np.array([a.frame]) if given else None)
     if given:
-        rig, (folder, verdict, _) = StereoRig.load(given), _beside(given, a.frame)
+        rig, (folder, verdict, _) = StereoRig.load(given), _results_of_rig(given, a.frame)
         if folder != str(recording.folder.resolve()):
-            text = f"{given}: nothing here tells that this rig fits this frame."
+            text = f"{given}: nothing here shows that this rig fits this frame."
             same = [f"--{name}={value}" for name in ("weights", "landmarks") if (value := getattr(a, name, None))]
             register = shlex.join(["python3", "-m", "lib", "register", str(a.recording), "--rig", str(given), *same])
             cure = f"Run: {register}; then give the moved_rig.json that it writes as --rig."
@@ -267,9 +267,9 @@ def _calibrated(
 
 
 def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = True) -> bool:
-    """Whether no cameras were `found`, or the verdict forbids results; then that is said, and only verdict.json written."""
+    """True if no cameras were `found` or the verdict forbids results; then only prints it and writes verdict.json."""
     if found and (a.force or not verdict.is_red):
-        (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
+        (out / "verdict.json").unlink(missing_ok=True)  # from an earlier run that was refused
         return False
     files.write_json(out / "verdict.json", verdict.to_json())
     force = "; --force writes the results whatever the verdict" if found else ""
@@ -302,13 +302,13 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
     rig.save(out / f"{prefix}rig.json")
     for side, camera in (("left", rig.left), ("right", rig.right)):
         write_opencv(camera, out / f"{prefix}{side}.yml", recording.image_size_px)
-        (info := out / f"{prefix}{side}_camera_info.yaml").unlink(missing_ok=True)  # that of an earlier run
+        (info := out / f"{prefix}{side}_camera_info.yaml").unlink(missing_ok=True)  # from an earlier run
         if not getattr(camera, "radial_per_px2", 0.0):
             write_ros(camera, info, recording.image_size_px, name=side)
 
 
 def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndarray) -> None:
-    """The pair with common rows, for any stereo network, and the matrices that lead back."""
+    """Write the rectified pair, for any stereo network, and the matrices from it to the images."""
     maps = rectify(rig, left.shape[:2], right.shape[:2])
     for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, maps.right_from_canvas)):
         warped = cv2.warpAffine(image, matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

@@ -1,6 +1,6 @@
-"""Correspondences: where the robot says a landmark is and where two cameras see it, each row at its own instant.
+"""Correspondences: a landmark's position as the robot reports it and its pixels in two images, each row at its own instant.
 
-Every later stage takes this type, whoever found the landmarks: detector, person or simulator (paper Eq. 2).
+All later stages use this type, whether a detector, a person or the simulator found the landmarks (paper Eq. 2).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -14,38 +14,38 @@ from lib.geometry import pair_covariance, points
 
 #: The landmarks of the forceps, in the order of every array.
 LANDMARKS = ("base", "tip_1", "tip_2")
-#: RGB of each landmark in every picture (Okabe and Ito 2008, told apart by all eyes).
+#: RGB of each landmark in all figures (Okabe and Ito 2008, distinguishable by the colour-blind).
 LANDMARK_COLOURS = {"base": (86, 180, 233), "tip_1": (230, 159, 0), "tip_2": (204, 121, 167)}
-#: A detection of lower confidence counts as not seen.
+#: Detections of lower confidence count as not seen.
 MIN_CONFIDENCE = 0.2
-#: The cure where a detector does not know the pictures.
+#: The cure in messages for a detector that is not trained for the images.
 TRAIN_FURTHER = "let the robot teach it: `python3 -m lib adapt RECORDING`"
-#: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
+#: Half the time over which a velocity is measured: long enough to average the robot's noise, short against its motion.
 _VELOCITY_S = 0.05
-#: What a row of each attribute of `Correspondences` is, in the order of its arguments.
+#: Shape of a row of each attribute of `Correspondences`, in the order of its arguments.
 _SHAPES = {"x_mm": (3,), "u_left": (2,), "u_right": (2,), "covariance_px2": (2, 2, 2), "confidence": (2,), "frame": (),
            "landmark": (), "time_s": ()}  # fmt: skip
 
 
 class DataError(ValueError):
-    """The data tell too little, or contradict themselves: no argument of the call would change that."""
+    """There is too little data, or it is inconsistent; no other argument of the call would help."""
 
 
 class NoDetectionError(DataError):
-    """Hardly any landmark was found in both images; the text counts them and says what to do."""
+    """Hardly any landmark was found in both images; the text states their number and the cure."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Rows of one landmark in one stereo frame, with NaN where the robot is silent or an image does not show it.
+    """Each row is one landmark in one stereo frame, with NaN where the robot reports none or an image does not show it.
 
     Attributes:
-        x_mm: (n, 3) as the robot reports, robot frame.
+        x_mm: (n, 3) position as the robot reports it, in the robot frame.
         u_left, u_right: (n, 2) px.
         covariance_px2: (n, 2, 2, 2): of the left and of the right pixel; NaN = unknown.
-        confidence: (n, 2) of left and right; 0 where missing, 1 for labels.
+        confidence: (n, 2), left and right; 0 where missing, 1 for labels.
         frame, landmark: (n,) number of the frame in its recording, and of the landmark (0 base, 1 tip_1, 2 tip_2).
-        time_s: (n,) video clock: the mean of the instants at which the two images' rows of the landmark were read.
+        time_s: (n,) video clock: the mean of the instants at which the landmark's row was read in the two images.
 
     >>> c = Correspondences.of_points([[0, 0, 0], [1, 0, 0]], [[5, 5], [105, 5]], [[9, 5], [np.nan, np.nan]])
     >>> len(c), len(c.complete), c.seen.tolist()
@@ -78,14 +78,14 @@ class Correspondences:
         covariance_px2: ArrayLike | None = None, confidence: ArrayLike | None = None, frame: ArrayLike | None = None,
         landmark: ArrayLike | None = None, time_s: ArrayLike | None = None,
     ) -> Self:  # fmt: skip
-        """From plain arrays of n rows; what is not given is unknown (covariance, time) or certain (confidence 1).
+        """Correspondences from arrays of n rows.  By default covariance and time are unknown, and the confidence is 1.
 
-        Without `frame` every row is a frame of its own, of landmark 0.
+        Without `frame` each row is its own frame; without `landmark` all rows are of landmark 0.
         """
         x, left, right = points(x_mm, 3, "x_mm"), points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
         n = len(x)
         if not n == len(left) == len(right):
-            raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give one of each a landmark.")
+            raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give as many of each.")
         confidence = np.isfinite([left, right]).all(axis=2).T if confidence is None else confidence
         return cls(
             x, left, right, np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2, confidence,
@@ -95,13 +95,13 @@ class Correspondences:
 
     @classmethod
     def join(cls, parts: Iterable[Self]) -> Self:
-        """The rows of several, in their order."""
+        """The rows of several correspondences, one after the other."""
         parts = list(parts)
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _SHAPES))
 
     @property
     def seen(self) -> np.ndarray:
-        """(n, 2) bool: the left and the right image show the landmark, with `MIN_CONFIDENCE` or more."""
+        """(n, 2) bool: True if the left or right image shows the landmark with at least `MIN_CONFIDENCE`."""
         return np.isfinite([self.u_left, self.u_right]).all(axis=2).T & (self.confidence >= MIN_CONFIDENCE)
 
     @property
@@ -111,7 +111,7 @@ class Correspondences:
 
     @property
     def is_complete(self) -> np.ndarray:
-        """(n,) bool: both images show the landmark and the robot reports it."""
+        """(n,) bool: True if both images show the landmark and the robot reports it."""
         return self.seen.all(axis=1) & np.isfinite(self.x_mm).all(axis=1)
 
     @property
@@ -120,7 +120,7 @@ class Correspondences:
         return self.subset(self.is_complete)
 
     def check_detections(self) -> None:
-        """Raise a `DataError` where an image shows fewer than four landmarks whose position the robot reports."""
+        """Raise a `DataError` if an image shows fewer than four landmarks whose position the robot reports."""
         if len(self) < 4:
             raise DataError(f"data: {len(self)} landmarks in all, and a camera needs four. Record more frames; 30 are good.")
         usable = int((self.seen & np.isfinite(self.x_mm).all(axis=1)[:, None]).sum(axis=0).min())
@@ -139,20 +139,20 @@ class Correspondences:
 
     @property
     def pair_covariance_px2(self) -> np.ndarray:
-        """(n, 4, 4) of (u_left, u_right); the two images' errors are independent."""
+        """(n, 4, 4) covariance of (u_left, u_right); the errors in the two images are independent."""
         return pair_covariance(self.covariance_px2, len(self))
 
     def subset(self, rows: slice | ArrayLike) -> Self:
-        """The rows that a slice, a mask or an array of indices names."""
+        """The rows selected by a slice, a mask or an array of indices."""
         rows = rows if isinstance(rows, slice) else np.asarray(rows)
         return type(self)(*(getattr(self, name)[rows] for name in _SHAPES))
 
     def of_frames(self, frames: ArrayLike) -> Self:
-        """The rows of these frames."""
+        """The rows of the given frames."""
         return self.subset(np.isin(self.frame, np.atleast_1d(frames)))
 
     def grid(self, name: str) -> np.ndarray:
-        """An attribute with one row a frame, (m, 3, ...): frames in ascending order, NaN where there is no row.
+        """An attribute as an array (m, k, ...): m frames in ascending order, k >= 3 landmarks; NaN where there is no row.
 
         >>> x, u = np.zeros((2, 3)), np.ones((2, 2))
         >>> c = Correspondences.of_points(x, u, u, frame=[4, 4], landmark=[0, 2])
@@ -171,23 +171,23 @@ def pair_with_robot(
     height_px: int, readout_s: float = 0.0, offset_s: float = 0.0, covariance_px2: ArrayLike | None = None,
     confidence: ArrayLike | None = None, frame: ArrayLike | None = None, linear: np.ndarray | None = None,
 ) -> Correspondences:  # fmt: skip
-    """Landmarks of m stereo frames with the robot's positions at the instants at which their image rows were read.
+    """Landmarks of m stereo frames, with the robot's positions at the instants at which their image rows were read.
 
     A rolling shutter reads the middle row at the frame's time and the last row half `readout_s` later, so the two
     images show a landmark at two instants.  The position is taken at their mean, and each pixel is moved to that
-    instant by the landmark's velocity.  A landmark seen in one image alone is taken at that image's instant.
+    instant by the landmark's velocity.  If only one image shows a landmark, its instant is used.
 
     Args:
         u_left, u_right: (m, k, 2) px, NaN = not seen; they give m * k rows, frame by frame.
-        position: Robot times (j, k) in s -> (j, k, 3) mm, NaN where it is silent: `lib.recordings.Kinematics.at`.
+        position: Robot times (j, k) in s -> (j, k, 3) mm, NaN = no report: `lib.recordings.Kinematics.at`.
         time_s: (m,) times of the frames, video clock.
         height_px, readout_s: Rows of an image, and time from the first to the last; 0 s is a global shutter.
         offset_s: t_robot = t_video + offset_s.
         covariance_px2, confidence: (m, k, 2, 2, 2) and (m, k, 2), left and right; None as in `Correspondences.of_points`.
         frame: (m,) numbers of the frames; None = 0 to m - 1.
-        linear: (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
+        linear: (4, 3) px per mm, left and right, to convert velocities into pixels; None = fitted to these rows.
 
-    A landmark moves down at 10 mm/s; at 100 px/mm a shutter of 20 ms sees it in the first and the last row, 20 ms apart:
+    A landmark moves down at 10 mm/s.  At 100 px/mm, a shutter of 20 ms reads it in the first and the last row, 20 ms apart:
 
     >>> def position(time_s):
     ...     return np.stack([0 * time_s, 10 * time_s, 0 * time_s], axis=-1)
@@ -197,14 +197,14 @@ def pair_with_robot(
     ([[0.0, 10.0, 0.0]], [[50.0, 10.0]], [[50.0, 90.0]])
     """
     if readout_s < 0 or height_px < 2:
-        raise ValueError(f"readout_s, height_px: {readout_s} and {height_px} make no shutter.")
+        raise ValueError(f"readout_s, height_px: expected at least 0 s and 2 px, got {readout_s} and {height_px}.")
     time, y = np.asarray(time_s, dtype=np.float64), np.stack([u_left, u_right], axis=2).astype(np.float64)
     if time.ndim != 1 or y.ndim != 4 or y.shape[0] != len(time) or y.shape[3] != 2:
         raise ValueError(f"u_left, u_right: expected ({time.size}, k, 2) px, got {np.shape(u_left)}, {np.shape(u_right)}.")
     m, k = y.shape[:2]
     delay = readout_s * (y[..., 1] / (height_px - 1) - 0.5)  # (m, k, 2), NaN where not seen
     n_seen = np.isfinite(delay).sum(axis=2)
-    mean_delay = np.nansum(delay, axis=2) / np.maximum(n_seen, 1)  # of neither image: the middle row
+    mean_delay = np.nansum(delay, axis=2) / np.maximum(n_seen, 1)  # 0, the middle row, if seen in neither
     row_time = time[:, None] + mean_delay
     x = np.asarray(position(row_time + offset_s), dtype=np.float64)
     if x.shape != (m, k, 3):
@@ -231,9 +231,9 @@ def of_recording(
     recording: object, u_left: ArrayLike, u_right: ArrayLike, *, frames: Sequence[int] | slice | None = None,
     **known: ArrayLike | None,
 ) -> Correspondences:  # fmt: skip
-    """`pair_with_robot` of some `frames` (None = all) of a `lib.recordings.Recording`, which knows clocks and shutter.
+    """`pair_with_robot` for the `frames` (None = all) of a `lib.recordings.Recording`, with its clock offset and shutter.
 
-    `known` are covariance_px2, confidence and linear, as there.
+    `known`: the arguments covariance_px2, confidence and linear of `pair_with_robot`.
     """
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     return pair_with_robot(
@@ -243,7 +243,7 @@ def of_recording(
 
 
 def _affine(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """A (2, 3) px per mm of the affine camera with the least sum of distances: it only turns small shifts into pixels."""
+    """A (2, 3) px per mm of the affine camera with the least sum of distances; accurate enough for small shifts."""
     known = np.isfinite(np.hstack([x, u])).all(axis=1)
     if known.sum() < 5:
         return np.zeros((2, 3))

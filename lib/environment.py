@@ -1,7 +1,7 @@
-"""Makes and checks ``.venv``: the environment that every command of the workbench runs in.
+"""Makes and checks ``.venv``, the environment in which all commands of the workbench run.
 
-Standard library only, since it runs on a bare Python.  `ensure` compares a stamp of the complete environment with
-environment.toml and its lock.  A half-made environment is made anew.  One process makes it while others wait.
+This module uses only the standard library, since it runs on a bare Python.  `ensure` compares a stamp in the environment with
+environment.toml and its lock.  An incomplete environment is made again.  One process makes it while others wait.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from lib.files import digest, write_text
 ROOT = Path(__file__).resolve().parent.parent
 TORCH_BUILDS = ("cpu", "cuda")
 _STAMP = "microstereo.json"
-#: What the lock leaves out: torch and the CUDA packages that only its default Linux build asks for.
+#: Packages that the lock leaves out: torch and the CUDA packages that only its default Linux build needs.
 _TORCH_PACKAGES = re.compile(r"(torch|triton|nvidia-.*|cuda-.*)")
 
 
 class Problem(Exception):
-    """The environment cannot be made; the text says why and what to type."""
+    """The environment cannot be made; the text says why and what to do."""
 
 
 def manifest(root: Path = ROOT) -> dict:
     """The parsed ``environment.toml``."""
-    import tomllib  # not at the top: the launcher must reach its friendly word on an older Python
+    import tomllib  # not at the top, so that an older Python still gets the launcher's message about its version
 
     return tomllib.loads((root / "environment.toml").read_text(encoding="utf-8"))
 
@@ -46,9 +46,9 @@ def python_of(venv: Path) -> Path:
 
 
 def ensure(root: Path = ROOT, torch: str | None = None) -> Path:
-    """The interpreter of a complete ``.venv`` in `root`, made, repaired or brought up to date first, or a `Problem`.
+    """Make, repair or update the ``.venv`` in `root` if needed, and return its interpreter; raises `Problem` on failure.
 
-    `torch` is ``"cpu"`` or ``"cuda"``; None keeps the build that is installed, or picks by whether there is an NVIDIA GPU.
+    `torch` is ``"cpu"`` or ``"cuda"``; None keeps the installed build, or else takes ``"cuda"`` if there is an NVIDIA GPU.
     """
     if not _is_ready(root, torch):
         with _sole_maker(root) as lock_file:
@@ -58,9 +58,9 @@ def ensure(root: Path = ROOT, torch: str | None = None) -> Path:
 
 
 def lock(*, upgrade: bool) -> Path:
-    """Write the lock anew from environment.toml: each package, for each platform, with hashes and no host.
+    """Write a new lock from environment.toml: every package for every platform, with hashes and without package index.
 
-    Pins that still fit are kept unless `upgrade` is given.  Needs uv (``pip install uv``) and the network.
+    Pins that still fit are kept unless `upgrade` is True.  Needs uv (``pip install uv``) and the network.
     """
     uv = shutil.which("uv")
     if not uv:
@@ -87,7 +87,7 @@ def _digest(root: Path) -> str:
 
 
 def _read_stamp(venv: Path) -> dict:
-    """{} where there is none; {"state": "making"} where the environment is half made."""
+    """The stamp: {} if there is none, {"state": "making", ...} if the environment is incomplete."""
     with contextlib.suppress(OSError, ValueError):
         return json.loads((venv / _STAMP).read_text(encoding="utf-8"))
     return {}
@@ -100,13 +100,13 @@ def _is_ready(root: Path, torch: str | None) -> bool:
         stamp.get("state") == "ready"
         and stamp["digest"] == _digest(root)
         and torch in (None, stamp["torch"])
-        and python_of(venv).exists()  # False for a link to an interpreter that has gone
+        and python_of(venv).exists()  # False for a link to an interpreter that was removed
     )
 
 
 @contextlib.contextmanager
 def _sole_maker(root: Path):
-    """Hold a lock, which the installer inherits: if this process is killed, the next waits until the orphan has ended."""
+    """Hold a lock, which the installer inherits: if this process is killed, the next one waits for the orphaned installer."""
     with open(root / "lib" / "environment.lock", "rb") as file:
         for attempt in itertools.count():
             try:
@@ -117,7 +117,7 @@ def _sole_maker(root: Path):
                     print("Another process is setting up the environment; waiting for it ...", flush=True)
                 time.sleep(0.5)
             except OSError:
-                break  # a file system without locks: go on alone
+                break  # a file system without locks: continue without one
         yield file
 
 
@@ -125,7 +125,7 @@ def _take(file) -> None:
     if os.name == "nt":
         import msvcrt
 
-        file.seek(1 << 30)  # a byte that no reader of the lock meets
+        file.seek(1 << 30)  # lock a byte that no reader of the file reads
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
     else:
         import fcntl
@@ -154,7 +154,7 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
     locked = ["--require-hashes", "--no-deps", "-r", str(root / workbench["lock"])]
     try:
         _install(venv, "packages", locked, lock_file, uv=shutil.which("uv"))
-    except Problem:  # uv reads nothing of pip's configuration, such as a mirror
+    except Problem:  # uv does not read pip's configuration, such as a mirror
         _install(venv, "packages with pip", locked, lock_file)
     version = next(pin.split("==")[1] for pin in settings["project"]["dependencies"] if pin.startswith("torch=="))
     _install(venv, f"torch ({torch})", torch_arguments(version, torch, sys.platform, workbench["torch"]), lock_file)
@@ -167,23 +167,23 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
 
 
 def _make_venv(venv: Path) -> None:
-    """An empty environment with pip in it, from the interpreter that runs this."""
+    """Make an environment that contains only pip, with the interpreter that runs this."""
     interpreter = getattr(sys, "_base_executable", sys.executable)
     if importlib.util.find_spec("ensurepip"):
         command = [interpreter, "-m", "venv", str(venv)]
     elif shutil.which("uv"):
         command = ["uv", "venv", "--quiet", "--seed", "--allow-existing", "--python", interpreter, str(venv)]
-    else:  # Debian and Ubuntu pack it apart
+    else:  # Debian and Ubuntu have venv in a separate package
         package = f"python{sys.version_info[0]}.{sys.version_info[1]}-venv"
         raise Problem(f"This Python cannot make virtual environments; install {package} (or uv), then start again.")
     _call(command, "The virtual environment cannot be made")
 
 
 def _install(venv: Path, what: str, arguments: list[str], lock_file, *, uv: str | None = None) -> None:
-    """Install into the environment with pip, or with uv where it is given, and tell the seconds that it takes."""
+    """Install into the environment with pip, or with uv if given, and print the seconds that have passed."""
     python = str(python_of(venv))
     pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "--quiet"]
-    # Compiled once here: every kernel and worker then starts in seconds, also where Python may not write bytecode.
+    # Compile the bytecode here, so that kernels and workers start in seconds even where Python may not write bytecode.
     command = [uv, "pip", "install", "--quiet", "--compile-bytecode", "--python", python] if uv else pip
     keep_lock = {} if os.name == "nt" else {"pass_fds": [lock_file.fileno()]}
     start, live = time.monotonic(), sys.stdout.isatty()
@@ -208,30 +208,30 @@ def _install(venv: Path, what: str, arguments: list[str], lock_file, *, uv: str 
 
 
 def torch_arguments(version: str, build: str, platform: str, indexes: dict) -> list[str]:
-    """What to tell pip for a build of torch; the lock already holds what the CPU build needs."""
+    """Arguments of pip for a build of torch; the packages that the CPU build needs are already in the lock."""
     if build == "cuda":
         if platform == "darwin":
             raise Problem("--torch cuda: there is no CUDA on a Mac; leave the option out.")
         if platform == "win32":
             return ["--index-url", indexes["windows_cuda_index"], f"torch=={version}"]
         return [f"torch=={version},!={version}+cpu"]
-    if platform == "linux":  # PyPI holds no version with "+", so it comes from PyTorch or from a mirror of one's own
+    if platform == "linux":  # PyPI has no versions with "+", so it comes from PyTorch's index or a configured mirror
         return ["--no-deps", "--extra-index-url", indexes["cpu_index"], f"torch=={version}+cpu"]
     return ["--no-deps", f"torch=={version}"]
 
 
 def _write_site_files(root: Path, venv: Path) -> None:
-    """`import lib` from any folder and kernel; no build dialog in JupyterLab (dash ships an extension's source)."""
+    """Make `import lib` work in any folder and kernel, and turn off JupyterLab's build dialog, which dash would cause."""
     script = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = Path(_call([str(python_of(venv)), "-c", script], "The new environment does not start").strip())
-    write_text(site / "microstereo.pth", os.path.relpath(root.resolve(), site.resolve()) + "\n")  # survives a move
+    write_text(site / "microstereo.pth", os.path.relpath(root.resolve(), site.resolve()) + "\n")  # relative: survives a move
     settings = venv / "etc" / "jupyter" / "labconfig" / "page_config.json"
     settings.parent.mkdir(parents=True, exist_ok=True)
     write_text(settings, json.dumps({"buildCheck": False, "buildAvailable": False}))
 
 
 def missing_libraries(libraries: dict[str, str]) -> str:
-    """One line about the `libraries`, shared object -> Debian package, that Open3D needs and this Linux lacks, or ""."""
+    """One line about missing system `libraries` (shared object -> Debian package) of Open3D on Linux, or ""."""
     lacks = [package for name, package in libraries.items() if not _loads(name)] if sys.platform == "linux" else []
     if not lacks:
         return ""
@@ -252,7 +252,7 @@ def _has_nvidia_gpu() -> bool:
 
 def _check_disk(folder: Path, needed_gb: float) -> None:
     free_gb = shutil.disk_usage(folder).free / 1e9
-    if free_gb < 1.3 * needed_gb:  # unpacking needs room of its own
+    if free_gb < 1.3 * needed_gb:  # unpacking needs additional space
         raise Problem(f"The environment needs {1.3 * needed_gb:.0f} GB of free disk; {folder} has {free_gb:.1f} GB.")
 
 

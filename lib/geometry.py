@@ -1,4 +1,4 @@
-"""Rigid transforms, pixel grids and the argument checks that several modules share.
+"""Rigid transforms, pixel grids, covariances of pixel pairs, and argument checks that several modules use.
 
 Conventions: points are rows, (n, 3) millimetres or (n, 2) pixels (x right, y down, integer coordinates are
 pixel centres); a transform is named ``target_from_source``; angles are radians.
@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
-    """`values`, (n, dimension) or a single point, as a float64 array (n, dimension); NaN passes.
+    """`values`, (n, dimension) or a single point, as a float64 array (n, dimension); NaN is allowed.
 
-    A ValueError of another shape names the argument `name`.
+    A ValueError refuses other shapes and names the argument `name`.
     """
     array = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if array.ndim != 2 or array.shape[1] != dimension:
@@ -25,7 +25,7 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 
 
 def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
-    """`points`, with NaN and infinity refused by a ValueError that counts the rows and names the first."""
+    """`points`, but a ValueError refuses NaN and infinity and states the number of such rows and the first one."""
     array = points(values, dimension, name)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
@@ -35,7 +35,7 @@ def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 
 
 def store_array(instance: object, name: str, shape: tuple[int, ...]) -> None:
-    """Make a frozen dataclass's attribute a read-only float64 array; a ValueError where it is not finite or of `shape`."""
+    """Make a frozen dataclass's attribute a read-only float64 array; a ValueError if it is not finite or not of `shape`."""
     array = np.array(getattr(instance, name), dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers of shape {shape}, got {array}.")
@@ -44,7 +44,7 @@ def store_array(instance: object, name: str, shape: tuple[int, ...]) -> None:
 
 
 def check(settings: object, names: str, holds: Callable[[object], bool], rule: str) -> None:
-    """Raise ValueError for the first of the attributes `names` (separated by spaces) whose value breaks the rule.
+    """Raise a ValueError for the first of the attributes `names` (separated by spaces) whose value violates the rule.
 
     >>> from types import SimpleNamespace
     >>> check(SimpleNamespace(gloss=-1), "gloss", lambda value: value >= 0, "must not be negative")
@@ -58,13 +58,13 @@ def check(settings: object, names: str, holds: Callable[[object], bool], rule: s
 
 
 def pair_covariance(covariance_px2: ArrayLike | None, n: int, images: int = 2) -> np.ndarray:
-    """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) where all share it, else (n, 4, 4).
+    """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) if it is the same for all, else (n, 4, 4).
 
     Args:
-        covariance_px2: A number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4)
-            one a match, or (n, 2, 2, 2) one a match and image.  None is 1 px^2.  NaN passes, for landmarks that are not
-            seen; a ValueError refuses what is not positive definite.
-        images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
+        covariance_px2: A number (the variance of each coordinate), (2, 2) for each image, (4, 4) for the pair, (n, 4, 4)
+            for each match, or (n, 2, 2, 2) for each match and image.  None is 1 px^2.  NaN is allowed, for landmarks that
+            are not seen; a ValueError refuses matrices that are not positive definite.
+        images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) replace (4, 4) and (n, 4, 4).
 
     >>> pair_covariance(4.0, 10)[0].diagonal()
     array([4., 4., 4., 4.])
@@ -87,7 +87,7 @@ def pair_covariance(covariance_px2: ArrayLike | None, n: int, images: int = 2) -
         forms = f"a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}) or ({n}, {images}, 2, 2)"
         raise ValueError(f"covariance_px2: expected {forms}, got {given.shape}.")
     known = np.where(np.isfinite(covariance), covariance, np.eye(m))
-    try:  # a factor looks at one triangle only; the mean of both lets neither pass unseen
+    try:  # the factorisation reads only one triangle, so average both to check both
         np.linalg.cholesky((known + known.mT) / 2)
     except np.linalg.LinAlgError:
         raise ValueError("covariance_px2: every covariance must be positive definite.") from None
@@ -95,14 +95,14 @@ def pair_covariance(covariance_px2: ArrayLike | None, n: int, images: int = 2) -
 
 
 def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Inverses (1 or n, m, m) of covariances (1 or n, m, m) of which only the `views` (n, m / 2) bool count; zero elsewhere.
+    """Inverses (1 or n, m, m) of the blocks of covariances (1 or n, m, m) for the `views` (n, m / 2) bool; zero elsewhere.
 
-    It is the limit of the inverse where the covariance of the other views grows beyond all bounds.
+    It is the limit of the inverse as the covariance of the other views goes to infinity.
     """
     if views.all():
         return np.linalg.inv(covariance)
     row = slice(None)
-    if len(covariance) == 1:  # rows that share the views share the inverse
+    if len(covariance) == 1:  # rows with the same views have the same inverse
         _, first, row = np.unique(views @ [1, 2][: views.shape[1]], return_index=True, return_inverse=True)
         views = views[first]
     used = np.repeat(views, 2, axis=1)
@@ -111,20 +111,20 @@ def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`np.cross` of vectors (..., 3), which takes several times as long for few of them."""
+    """Cross product of vectors (..., 3); for few vectors `np.cross` takes several times as long."""
     after = np.array([1, 2, 0])
     return (a * b.take(after, -1, mode="wrap") - a.take(after, -1, mode="wrap") * b).take(after, -1, mode="wrap")
 
 
 def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distances (n, m / 2) of residuals (n, m), each view's by its own block of covariances (n, m, m)."""
+    """Squared Mahalanobis distances (n, m / 2) of residuals (n, m), for each view by its block of covariances (n, m, m)."""
     r = residual.reshape(len(residual), -1, 2, 1)
     own = np.stack([covariance[:, i : i + 2, i : i + 2] for i in range(0, residual.shape[1], 2)], axis=1)
     return (r.mT @ np.linalg.solve(own, r))[..., 0, 0]
 
 
 def align_rotation(moment: ArrayLike) -> np.ndarray:
-    """The rotation R (..., 3, 3) that maximises trace(R^T moment), the one nearest to `moment`.
+    """The rotation R (..., 3, 3) nearest to `moment`; it maximises trace(R^T moment).
 
     With moment = sum y x^T of two centred point sets it is the least-squares alignment y = R x (Kabsch, 1976; Umeyama, 1991).
 
@@ -153,7 +153,7 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> Self:
-        """The transform that moves nothing."""
+        """The transform that leaves all points unchanged."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
@@ -162,7 +162,7 @@ class RigidTransform:
         return cls(Rotation.from_rotvec(np.asarray(rotation_rad, dtype=float)).as_matrix(), np.asarray(t_mm))
 
     def apply(self, x: ArrayLike) -> np.ndarray:
-        """Points (n, 3) or one point (3,) moved from the source to the target frame."""
+        """Points (n, 3) or one point (3,) transformed from the source to the target frame."""
         array = np.asarray(x, dtype=np.float64)
         if array.shape[-1:] != (3,):
             raise ValueError(f"x: expected 3 coordinates in the last axis, got shape {array.shape}.")
@@ -178,7 +178,7 @@ class RigidTransform:
 
 
 def image_from_cell(u_cell: ArrayLike, stride: ArrayLike) -> np.ndarray:
-    """Pixels of the finer grid from cells of the coarser: u = s * u_cell + (s - 1) / 2, per axis.
+    """Pixels of the finer grid from cells of the coarser grid: u = s * u_cell + (s - 1) / 2, per axis.
 
     Integer coordinates are centres on both grids.  `stride` is a number, not always an integer, or (s_x, s_y).
     """

@@ -1,4 +1,4 @@
-"""Levenberg and Marquardt's damped least squares, for any energy that knows its own normal equations.
+"""Damped least squares (Levenberg-Marquardt) for energies that are given with their normal equations.
 
 Nocedal and Wright, "Numerical Optimization", 2006, Sec. 10.3.
 """
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def inverse(information: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) from the information of parameters whose units may differ widely.
+    """Inverse (p, p) of an information matrix, that is the covariance, of parameters whose units may differ widely.
 
     >>> inverse(np.diag([4.0, 1e-8])).round(2).tolist()
     [[0.25, 0.0], [0.0, 100000000.0]]
@@ -22,9 +22,9 @@ def inverse(information: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the energy is least: `state`, `energy` and `work` as the caller's functions made them.
+    """A minimum: its `state`, and `energy` and `work` as the caller's functions returned them.
 
-    `information` (p, p) is the Gauss-Newton Hessian there; `converged` is False where the `iterations` ran out.
+    `information` (p, p) is the Gauss-Newton Hessian there; `converged` is False if the number of iterations was reached.
     """
 
     state: Any
@@ -43,14 +43,14 @@ def minimise(
 
     Args:
         start: The first state, of any type.
-        evaluate: state -> (energy, work), None where the state is not allowed; `work` is for `normal_equations`.
+        evaluate: state -> (energy, work), or None if the state is not allowed; `work` is passed to `normal_equations`.
         normal_equations: (state, work) -> (information (p, p), gradient (p,)): the Gauss-Newton Hessian of the energy
-            and the direction J^T W r in which the energy falls.
-        move: (state, step (p,)) -> the state after an increment.
-        rank: Number of directions that the data determine; steps leave the others alone.  None is all p.
-        iterations, tolerance: Most steps; a step that promises a smaller decrease of the energy, relative to it, is the end.
+            and its negative gradient J^T W r.
+        move: (state, step (p,)) -> the state after the step.
+        rank: Number of directions that the data determine; steps do not change the others.  None is all p.
+        iterations, tolerance: Largest number of steps; smallest relative decrease of the energy that is worth a step.
 
-    A ValueError refuses a start that is not allowed.  The x where exp(x) = 2:
+    A ValueError refuses a start that is not allowed.  Example: the x with exp(x) = 2.
 
     >>> def evaluate(x):
     ...     return 0.5 * float(2 - np.exp(x)) ** 2, 2 - np.exp(x)
@@ -82,7 +82,7 @@ def minimise(
                 break
             damping = max(10.0 * damping, 1e-6)
         else:
-            converged = True  # no step lowers the energy: the floor of rounding
+            converged = True  # no step lowers the energy: the limit of rounding
             break
         state, (energy, work), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
     return Minimum(state, energy, work, information, converged)

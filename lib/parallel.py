@@ -1,6 +1,6 @@
 """Many jobs on a Dask cluster: the cores of this machine, or any cluster whose scheduler is given.
 
-A job makes one file or folder.  What exists is not made again, so that work that was stopped goes on where it was.
+Each job makes one file or folder.  Existing ones are not made again, so stopped work continues where it was.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from pathlib import Path
 from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
-#: A scheduler must answer within these seconds.
+#: Time within which a scheduler must answer, seconds.
 ANSWER_S = 15.0
 _loaded_libraries = cache(ThreadpoolController)
 
@@ -24,23 +24,23 @@ def run_jobs(
     function: Callable[..., object], jobs: Mapping[Path, tuple], *, workers: int | None = None,
     scheduler: str | None = None, title: str = "", unit: str = "job", progress: bool = True,
 ) -> Iterator[tuple[Path, BaseException | None]]:  # fmt: skip
-    """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each path, and the error that ended it.
+    """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each path with its error or None.
 
-    A job whose worker was killed goes to another, three times at most.  Closing the iterator drops jobs that have not begun.
+    If a worker is killed, its job is given to another one, at most three times.  Closing the iterator drops waiting jobs.
 
     Args:
-        function: Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.
-        workers: Processes on this machine, at most one a job; None is one a core.
+        function: Importable (not a closure).  It makes `path` completely or not at all, as `lib.files.whole` does.
+        workers: Number of processes on this machine, at most one for each job; None is one for each core.
         scheduler: Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this
-            machine. Its workers need this environment and the same folders; if it does not answer, a ConnectionError.
-        title, unit, progress: Of the progress bar.
+            machine.  Its workers need this environment and the same folders.  If it does not answer: ConnectionError.
+        title, unit, progress: Text and unit of the progress bar; False shows no bar.
     """
     missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
     known = {"total": len(jobs), "initial": len(jobs) - len(missing), "desc": title, "unit": unit}
     with tqdm(**known, disable=not progress, smoothing=0.1) as bar:
         if not missing:
             return
-        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker imports the script; the parent tells
+        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports an unguarded script
             raise SystemExit(1)
         from distributed import KilledWorker, as_completed
 
@@ -56,18 +56,18 @@ def run_jobs(
                     bar.update()
                     yield futures[future], error
             finally:
-                with contextlib.suppress(Exception):  # the scheduler may have gone
+                with contextlib.suppress(Exception):  # the scheduler may be gone
                     client.cancel(list(futures))
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager
 def single_threaded_torch() -> Iterator[None]:
-    """Run the block with one thread of torch's own: for many small tensors more threads only spin."""
+    """Run the block with a single torch thread: for many small tensors more threads only waste time."""
     import torch
 
     threads = torch.get_num_threads()
@@ -80,24 +80,24 @@ def single_threaded_torch() -> Iterator[None]:
 
 @contextlib.contextmanager
 def single_threaded_blas() -> Iterator[None]:
-    """Run the block, or the function that this decorates, with one thread of numpy's and scipy's linear algebra.
+    """Run the block, or the decorated function, with a single thread for numpy's and scipy's linear algebra.
 
-    For many small matrices more threads gain nothing, and where cores are busy they wait for each other.  The limit is the
-    process's: blocks of several threads that overlap may leave it set.
+    For many small matrices more threads gain nothing, and on busy cores they wait for each other.  The limit applies to the
+    whole process: if blocks in several threads overlap, it may stay set.
     """
     with _loaded_libraries().limit(limits=1, user_api="blas"):
         yield
 
 
 def _work(function: Callable, path: Path, *arguments: object) -> None:
-    """In a worker.  The path exists if an attempt before was lost just after its end."""
+    """Run a job in a worker.  The path may exist already, if an earlier attempt was lost just after it had finished."""
     if not path.exists():
         function(path, *arguments)
 
 
 @contextlib.contextmanager
 def _client(workers: int, scheduler: str | None):
-    """A client of the cluster: of a given scheduler, or of processes on this machine that end with the block."""
+    """A client of the given scheduler, or of processes on this machine that end with the block."""
     from unittest.mock import patch
 
     import dask
@@ -126,7 +126,7 @@ def _client(workers: int, scheduler: str | None):
                 dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
             )  # fmt: skip
         except RuntimeError as error:
-            need = 'Each imports your script: put what that runs under `if __name__ == "__main__":`.'
+            need = 'Each imports your script: put the code that it runs under `if __name__ == "__main__":`.'
             raise RuntimeError(f"The worker processes did not start ({error}). {need}") from None
         with cluster, Client(cluster) as client:
             yield client

@@ -1,4 +1,4 @@
-"""Where things lie: the one place that knows the folders of the workbench."""
+"""The folders of the workbench; all other modules take them from here."""
 
 from pathlib import Path
 
@@ -12,14 +12,14 @@ CACHE = DATA / "cache"
 RUNS = ROOT / "runs"
 SHIPPED_RECORDING = DATA / "open_sky_eye"
 
-#: In a folder of results: the recording's place, since recordings of two folders may have one name.
+#: File in a folder of results with the recording's path, since recordings in different folders may have the same name.
 RECORDING_NOTE = "recording.txt"
-#: Names the folder in which notebooks of one run, or commands, share what each would else work out again.
+#: Environment variable with the folder in which the notebooks of a run, or commands, share results to save time.
 SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
 
 def results_folder(name: str, recording: Path) -> Path:
-    """Make the folder runs/NAME for a recording's results; a FileExistsError where it holds another recording's."""
+    """Make the folder runs/NAME for a recording's results; a FileExistsError if it has those of another recording."""
     folder, recording = RUNS / name, recording.resolve()
     note = folder / RECORDING_NOTE
     if note.is_file() and (other := Path(note.read_text(encoding="utf-8").strip())) != recording and other.is_dir():
@@ -30,6 +30,6 @@ def results_folder(name: str, recording: Path) -> Path:
 
 
 def shown(path: Path) -> str:
-    """A path as a user types it in the workbench's folder: relative to it where it lies inside."""
+    """A path as a user types it in the workbench's folder: relative to it if it is inside."""
     path = Path(path).absolute()
     return str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path)

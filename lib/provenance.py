@@ -1,4 +1,4 @@
-"""Provenance of a result: command, commit, machine, date, wall seconds and CPU seconds."""
+"""Provenance of a result: command, commit, machine, date, wall-clock time and CPU time."""
 
 import datetime
 import functools
@@ -14,13 +14,13 @@ import numpy as np
 from lib import files, paths
 from lib.parallel import cores
 
-#: What decides a result: these files of the repository, and not the results that are being written.
+#: The files of the repository that can change a result; results that are being written do not count as modified code.
 _CODE = ("lib", "notebooks", "tests", "environment.toml")
 _GPU_NAMES = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
 
 
 def commit(root: Path = paths.ROOT) -> dict | None:
-    """The checked-out commit, {"id": ..., "modified": whether the code differs from it}; None outside a git checkout."""
+    """The checked-out commit {"id": ..., "modified": True if the code differs from it}; None outside a git checkout."""
     git = ["git", "-C", str(root)]
     with suppress(OSError, subprocess.CalledProcessError):
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
@@ -30,7 +30,7 @@ def commit(root: Path = paths.ROOT) -> dict | None:
 
 
 def commit_id() -> str:
-    """The commit in one word, its first 12 characters, and "+modified" if files differ; "unknown" outside a git checkout."""
+    """The first 12 characters of the commit, with "+modified" if the code differs; "unknown" outside a git checkout."""
     found = commit()
     return found["id"][:12] + "+modified" * found["modified"] if found else "unknown"
 
@@ -40,27 +40,27 @@ def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
     processor = platform.processor() or platform.machine()
     memory_gb = gpu = None
-    with suppress(OSError):  # no Linux
+    with suppress(OSError):  # not Linux
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
     with suppress(AttributeError, ValueError, OSError):  # Windows
         memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     with suppress(OSError, subprocess.SubprocessError, IndexError):  # no driver, no answer, or no GPU
-        told = subprocess.run(_GPU_NAMES, capture_output=True, text=True, timeout=20, check=True).stdout
-        gpu = told.splitlines()[0].strip()
+        names = subprocess.run(_GPU_NAMES, capture_output=True, text=True, timeout=20, check=True).stdout
+        gpu = names.splitlines()[0].strip()
     system = f"{platform.system()} {platform.release()}"
     return {"system": system, "processor": processor, "cores": cores(), "memory_gb": memory_gb, "gpu": gpu}
 
 
 class Provenance:
-    """Made when a measurement starts: what a user types to measure the same anew, the commit whose code runs, the clocks."""
+    """Create at the start of a measurement; holds the command that repeats it, the commit, and the start of the clocks."""
 
     def __init__(self, command: str) -> None:
         self.command, self.commit = command, commit()
         self.wall_s, self.cpu_s = time.perf_counter(), sum(os.times()[:4])
 
     def so_far(self) -> dict[str, object]:
-        """What is known now, as `lib.workbench.results.write` takes it; CPU seconds count finished child processes too."""
+        """The entries for `lib.workbench.results.write`; CPU seconds include finished child processes."""
         return {
             "command": self.command, "commit": self.commit, "machine": machine(),
             "weights": files.digest(paths.MODELS / "default.safetensors"), "date": datetime.date.today().isoformat(),
@@ -69,7 +69,7 @@ class Provenance:
 
 
 def plain(value: object) -> object:
-    """What JSON holds: lists for arrays and tuples, numbers of 6 digits, None for NaN and infinity."""
+    """A value for JSON: lists instead of arrays and tuples, numbers with 6 digits, None instead of NaN and infinity."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value

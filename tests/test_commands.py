@@ -74,7 +74,7 @@ def test_frames_calibrate_a_part_on_its_own(out, tmp_path, monkeypatch, capsys):
     assert json.loads((results / "calibration.json").read_text())["frames"] == [0, 17]
     assert np.abs(StereoRig.load(results / "rig.json").left.matrix - StereoRig.load(out / "rig.json").left.matrix).max() > 0
     folder = str(paths.SHIPPED_RECORDING.resolve())
-    assert [commands._beside(results / "rig.json", frame)[0] for frame in (0, 16, 17)] == [folder, folder, ""]
+    assert [commands._results_of_rig(results / "rig.json", frame)[0] for frame in (0, 16, 17)] == [folder, folder, ""]
     with pytest.raises(SystemExit):
         commands.main_reconstruct([*argv, "--frames", "5:9", "--frame", "9"])
     assert "--frame: choose one of frames 5 to 8." in capsys.readouterr().err
@@ -130,8 +130,8 @@ def test_register_says_where_no_motion_explains_the_landmarks(out):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     rows = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
     found = SimpleNamespace(data=rows, calibration=SimpleNamespace(pair=rig, offsets=None))
-    assert commands._as_one(rig, found, None).reasons == ()
-    (reason,) = commands._as_one(other, found, None).reasons
+    assert commands._common_motion(rig, found, None).reasons == ()
+    (reason,) = commands._common_motion(other, found, None).reasons
     assert reason.name == "no_common_motion" and reason.level == "not trustworthy" and "--rig" in reason.cure
 
 
@@ -229,7 +229,7 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
 @pytest.mark.parametrize(("command", "argv", "said"), [
     ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model, --frames: with --rig no camera is calibrated"),
     ("reconstruct", ["--rig", "rig.json", "--frames", "0:9"], "--model, --frames: with --rig no camera is calibrated"),
-    ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector looks"),
+    ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector is used"),
     ("detect", ["--force"], "unrecognized arguments: --force"),
     ("register", ["--rig", "rig.json", "--setting", "fast"], "unrecognized arguments: --setting"),
     ("import", ["--guess", "--map", "map.toml", "--overwrite"], "--guess writes a mapping only"),

@@ -379,7 +379,7 @@ class _Work:
         self.report["notes"].append(
             "The robot's labels in the images have standard deviations of "
             f"{', '.join(f'{sd:.1f}' for sd in labels_sd_px)} px ({', '.join(LANDMARKS)}). Most of that error is the same in "
-            "all frames, so the agreement with the robot does not show it."
+            "all frames. So neither the agreement with the robot nor the weights' covariance and confidence contain it."
         )
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),

@@ -1,4 +1,4 @@
-"""Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
+"""Calibration of affine and near-affine cameras from a robot's kinematics, with its uncertainty (paper Sec. IV-A)."""
 
 from lib.calibration.affine import affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets, OnlineCalibration, Optics, optics

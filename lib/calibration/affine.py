@@ -1,8 +1,8 @@
 """The affine stereo problem in closed form: DLT, the global minimum of Eq. (3), noise levels.
 
-With y = (u_left, u_right) stacked, y = A x + t + noise.  Minimising the paper's Eq. (3) over the corrected pixels
-and points leaves E = 1/2 sum r^T S^-1 r with r = y - A x - t and S = v_u I + v_x A A^T, the same S for every point.
-So E depends on the data only through their second moments, and its global minimum is an eigenvector problem
+With y = (u_left, u_right) stacked, y = A x + t + noise.  Eliminating the corrected pixels and points from the paper's
+Eq. (3) gives E = 1/2 sum r^T S^-1 r with r = y - A x - t and S = v_u I + v_x A A^T.  S is the same for every point,
+so E depends on the data only through their second moments, and its global minimum is an eigenvector problem
 (errors-in-variables, total least squares; Golub and Van Loan, "An analysis of the total least squares problem", 1980).
 """
 
@@ -17,9 +17,9 @@ from lib.cameras import AffineCamera
 
 
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
-    """Affine direct linear transform of one camera: least squares of u = M [x; 1] (paper Eq. 4).
+    """Affine direct linear transform of one camera: least-squares solution of u = M [x; 1] (paper Eq. 4).
 
-    The points x_mm (n, 3) and pixels u (n, 2), n >= 4, must be finite and not coplanar (else a ValueError).
+    A ValueError refuses points x_mm (n, 3) and pixels u (n, 2) unless n >= 4, all are finite and x_mm is not coplanar.
 
     >>> x = np.vstack([np.zeros(3), np.eye(3)])
     >>> dlt(x, AffineCamera([[100, 1, 8, 960], [2, 100, 3, 540]]).project(x)).matrix.round(6).tolist()
@@ -31,14 +31,14 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
 
 
 def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """[A, t] (m, 4) of the least-squares fit y = A x + t, on centred and scaled points."""
+    """[A, t] (m, 4) of the least-squares fit y = A x + t, computed with centred and scaled points."""
     mean, scale = x.mean(axis=0), x.std() or 1.0
     A = np.linalg.lstsq((x - mean) / scale, y - y.mean(axis=0), rcond=None)[0].T / scale
     return np.column_stack([A, y.mean(axis=0) - A @ mean])
 
 
 class AffineMinimum(NamedTuple):
-    """The cameras [A, t] stacked as `matrix` (m, 4), and the energy `cost` there."""
+    """The stacked cameras [A, t] as `matrix` (m, 4), and their energy `cost`."""
 
     matrix: np.ndarray
     cost: float
@@ -48,15 +48,15 @@ def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: 
     """Global minimum of 1/2 sum |y - A x~ - t|^2 / variance_u + |x~ - x|^2 / variance_x over A, t and every x~.
 
     Positions x (n, 3) are in mm, stacked pixels y (n, m) in px, the variances in px^2 and mm^2.
-    With z = (y / sigma_u, x / sigma_x) centred, the energy is the squared distance of the z to a 3-dimensional
-    subspace, so the three leading eigenvectors of their scatter solve it: no initial value, no iteration.
-    variance_x = 0 is plain least squares (DLT).
+    With z = (y / sigma_u, x / sigma_x) centred, the energy is half the sum of squared distances of the z to a
+    3-dimensional subspace.  The three leading eigenvectors of the scatter matrix of z span the best subspace, so no
+    initial value and no iteration are needed.  variance_x = 0 is plain least squares (DLT).
     """
     z, m = np.hstack([y, x]), y.shape[1]
     mean = z.mean(axis=0)
     z -= mean
     scatter = z.T @ z
-    if variance_x <= 1e-14 * (np.linalg.eigvalsh(scatter[m:, m:])[0] / len(x)):  # next to the smallest spread of x
+    if variance_x <= 1e-14 * (np.linalg.eigvalsh(scatter[m:, m:])[0] / len(x)):  # negligible against the spread of x
         A = np.linalg.solve(scatter[m:, m:], scatter[m:, :m]).T
         cost = 0.5 * np.trace(scatter[:m, :m] - A @ scatter[m:, :m]) / variance_u
     else:
@@ -69,11 +69,11 @@ def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: 
 
 
 def paper_variances(sigma_u_px: float, sigma_x_mm: float) -> tuple[float, float]:
-    """(variance_u, variance_x) that make `affine_minimum` minimise Eq. (3) exactly as printed.
+    """(variance_u, variance_x) with which `affine_minimum` minimises Eq. (3) exactly as printed.
 
     Eq. (3) weighs the pixel term by 1/sigma_u, the point term by 1/sigma_x and the reprojection term by 1.
-    Eliminating the corrected pixels leaves the weight a/(1 + a), a = 1/sigma_u, so 1 + sigma_u stands for the variance;
-    sigma_x stands for the point's.  The result depends on the unit of length, here mm.
+    Eliminating the corrected pixels gives the weight a/(1 + a), a = 1/sigma_u, so 1 + sigma_u takes the place of the
+    pixels' variance, and sigma_x that of the points'.  The result depends on the unit of length, here mm.
     """
     return 1.0 + sigma_u_px, sigma_x_mm
 
@@ -84,11 +84,11 @@ def estimate_noise(
 ) -> tuple[float, float]:  # fmt: skip
     """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
-    Along the epipolar direction (n^T A = 0) only sigma_u shows; the other directions add sigma_x.  Maximum likelihood by
-    Fisher scoring over the eigenvectors of A A^T, of the `views` (n, m / 2) bool that each row has (None = all).  Single
-    views have no epipolar direction: unless one level is given, all is put down to the pixels.  `parameters` is the
-    number of fitted ones; a level that is given is kept.  With the covariances (1 or n, m, m) that a detector claims in
-    place of I, they are scaled up where it errs more, never down, and sigma_u is the RMS of the scaled ones.
+    Along the epipolar direction e (e^T A = 0) the noise is sigma_u alone; other directions contain sigma_x, too.  Fisher
+    scoring maximises the likelihood of the residuals along the eigenvectors of A A^T, for the `views` (n, m / 2) bool of
+    each row (None = all).  Single views have no epipolar direction: without pairs sigma_x is 0 unless one level is given.
+    `parameters` is the number of fitted parameters.  A given level is kept.  `claimed_px2` (1 or n, m, m), a detector's
+    covariances, take the place of I: one factor of 1 or more scales them, and sigma_u is the RMS of the scaled ones.
     """
     n, m = residuals.shape
     code = np.full(n, 3) if views is None else views @ [1, 2][: m // 2]
@@ -100,7 +100,7 @@ def estimate_noise(
     if claimed_px2 is not None and sigma_u_px is not None:
         known[0] = unit
     free, share = np.isnan(known), 1.0 - parameters / count
-    if share * count < 2 * m or not free.any():  # nothing to learn from: the weights that make plain least squares
+    if share * count < 2 * m or not free.any():  # too few residuals: noise levels that give plain least squares
         return tuple(np.where(free, [unit, 0.0], known).tolist())
     parts = []
     for kind in np.unique(code):
@@ -115,17 +115,17 @@ def estimate_noise(
     least[0] = max(least[0], floor)
     if free.all() and not (np.bincount(code, minlength=4)[3] >= 4 and m > 2):
         return float(unit * np.sqrt(max((freedom @ observed) / freedom.sum(), least[0]))), 0.0
-    # A start that is right where either noise is negligible.
+    # The initial value is right if either noise is negligible.  `flat`: directions with the least sigma_x.
     flat = gain <= max(gain.min() * (1.0 + 1e-9), 1e-9 * gain.max())
     v = np.where(free, [max((freedom @ (observed * flat)) / (freedom @ flat), least[0]), 0.0], (known / [unit, 1.0]) ** 2)
     if free[1] and not flat.all():
         v[1] = np.median(np.maximum(observed[~flat] - v[0], 0.0) / gain[~flat])
     design = np.column_stack([np.ones(len(gain)), gain])
     scale, start = design[:, free].max(axis=0), np.where(free, least, v)
-    columns, left, likely = design[:, free] / scale, observed - design @ start, np.sqrt(freedom)
+    columns, excess, root_freedom = design[:, free] / scale, observed - design @ start, np.sqrt(freedom)
     for _ in range(50):
-        root, new = likely / np.maximum(design @ v, floor), start.copy()
-        new[free] += nnls(columns * root[:, None], left * root)[0] / scale
+        root, new = root_freedom / np.maximum(design @ v, floor), start.copy()
+        new[free] += nnls(columns * root[:, None], excess * root)[0] / scale
         if (np.abs(new - v) <= 1e-10 * v).all():
             break
         v = new
@@ -133,5 +133,5 @@ def estimate_noise(
 
 
 def noise_rms_px(covariance_px2: np.ndarray) -> float:
-    """Standard deviation of a pixel coordinate that covariances (n, m, m) claim."""
+    """RMS standard deviation of a pixel coordinate over covariances (n, m, m)."""
     return float(np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2).mean() / covariance_px2.shape[1]))

@@ -1,4 +1,4 @@
-"""`Calibration`: cameras, how well they are known, what they tell of the optics, and how new frames move them."""
+"""`Calibration`: cameras and their uncertainty; `optics`: the pair's geometry; `OnlineCalibration`: updates by new rows."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,13 +17,13 @@ from lib.least_squares import inverse
 
 @dataclass(frozen=True, eq=False)
 class LandmarkOffsets:
-    """Where the landmarks are seen, relative to where the robot reports them.
+    """Constant offsets of the landmarks that the detector sees from those that the robot reports.
 
     Attributes:
-        offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px; (k, d, d) of each landmark.
-        prior_sd: Of a coordinate before the data, given or chosen by the evidence.
-        p_value: Probability of offsets as large as the data show if there are none (score test).
-        turns: The axes are those of the landmarks where they are seen, not where the robot reports them.
+        offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images; (k, d, d).
+        prior_sd: Standard deviation of an offset's coordinate in the prior, given or chosen by maximum evidence.
+        p_value: Probability of offsets at least as large as the data show, if there are none (score test).
+        turns: True if the axes are those of the landmarks as detected, False if those of the landmarks as reported.
     """
 
     offset: np.ndarray
@@ -34,26 +34,26 @@ class LandmarkOffsets:
 
     @property
     def standard_deviation(self) -> np.ndarray:
-        """(k, d) of the offsets."""
+        """(k, d) standard deviations of the offsets' coordinates."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Cameras, and how well they are known; `lib.calibration.calibrate` makes it.
+    """Cameras and their uncertainty, the result of `lib.calibration.calibrate`.
 
     Attributes:
         minimum: The fit to the inliers.
-        parameter_covariance: (p, p) of the model's own parameters.
-        view_inliers: (n, cameras) bool, the views used, one row for each row given.
-        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; the RMS of the detector's scaled covariances where given.
-        model, weighting, image_size_px: As asked for.
-        x_mm, y_px, residuals_px: (n, 3), (n, m) and u - project(x), m = 2 cameras, robot error included; moved by the
-            offsets.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
-        covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m).
-        effective_rows: As how many rows of independent errors the inliers count: fewer where a landmark's errors are alike
-            from frame to frame.  The covariances allow for that, and for a noise level that is estimated.
-        detector_scale: By how much more than it claims the detector errs, 1 or more; `covariance_px2` allows for that.
+        parameter_covariance: (p, p) covariance of the model's parameters.
+        view_inliers: (n, cameras) bool: the views used, one row for each row of the data.
+        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; sigma_u_px is the RMS of `covariance_px2` if that is given.
+        model, weighting, image_size_px: As given to `calibrate`.
+        x_mm, y_px, residuals_px: (n, 3), (n, m) and y - project(x), m = 2 per camera, with the offsets applied.  Residuals
+            contain the robot's errors.  NaN in unusable rows: a landmark is missing, or a tool with shut jaws has no axes.
+        covariance_px2: The detector's covariances, scaled: None, (1, m, m), or (n, m, m).
+        effective_rows: The number of rows with independent errors that are as informative as the inliers; smaller where a
+            landmark's errors are correlated from frame to frame.  The covariances allow for this and for estimated noise.
+        detector_scale: Factor, 1 or more, on the detector's standard deviations; `covariance_px2` includes it.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
@@ -80,7 +80,7 @@ class Calibration:
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        """One or two, near-affine if the model has 1/distance or radial distortion."""
+        """The one or two cameras; they are near-affine if the model has 1/distance or radial distortion."""
         return self.minimum.state.cameras()
 
     @cached_property
@@ -90,7 +90,7 @@ class Calibration:
 
     @property
     def pair(self) -> StereoRig:
-        """`rig`; a ValueError for a single camera."""
+        """The same as `rig`, but a ValueError refuses a single camera."""
         if self.rig is None:
             raise ValueError("calibration: this needs a stereo pair, not a single camera; calibrate with [u_left, u_right].")
         return self.rig
@@ -102,7 +102,7 @@ class Calibration:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first, in px^2, px^2/mm, px^2/mm^2."""
+        """(8 c, 8 c): covariance of the entries of the c matrices M, row by row, left first; px^2, px^2/mm, px^2/mm^2."""
         G = self.minimum.state.matrix_jacobian()
         return G @ self.parameter_covariance @ G.T
 
@@ -113,7 +113,7 @@ class Calibration:
 
     @property
     def usable(self) -> np.ndarray:
-        """(n,) bool: the rows that could be used in at least one view; those that are no inliers are outliers."""
+        """(n,) bool: the rows that could be used in at least one view; usable rows that are not inliers are outliers."""
         return np.isfinite(self.residuals_px).any(axis=1)
 
     @property
@@ -123,19 +123,19 @@ class Calibration:
 
     @property
     def reprojection_rms_px(self) -> float:
-        """RMS over the views used of the distance |u - project(x)| in an image."""
+        """RMS of the distance |u - project(x)| in an image, over the views used."""
         return self._rms(self.residuals_px[self.inliers])
 
     @property
     def chi_square(self) -> tuple[float, int]:
-        """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
+        """Chi-square of the inliers and its degrees of freedom; the two are nearly equal if model and noise levels fit."""
         _, _, weight, r = self.system
         value = float((r[:, None] @ weight @ r[:, :, None]).sum())
         return value, 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
 
     @property
     def inverse_distance_per_mm(self) -> tuple[float, float]:
-        """1/d and its standard deviation (the first, where each camera has its own); (0, 0) for affine models."""
+        """1/distance in 1/mm (of the first camera, if each has its own) and its standard deviation; (0, 0) if affine."""
         for i, name in enumerate(self.parameter_names):
             if "1/distance" in name:
                 return float(self.minimum.state.rho[0]), float(np.sqrt(self.parameter_covariance[i, i]))
@@ -147,18 +147,18 @@ class Calibration:
         return self.sigma_u_px**2 * np.eye(2 * len(self.cameras))
 
     def detection_covariance(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2 of new detections of the pair: as stated and scaled; `noise_px2` of rows that state none."""
+        """(n, 4, 4) px^2 of new detections: those stated, scaled by `detector_scale`; `noise_px2` for rows without."""
         own = data.pair_covariance_px2
         stated = np.isfinite(own).all(axis=(1, 2), keepdims=True) & (self.covariance_px2 is not None)
         return np.where(stated, self.detector_scale**2 * own, self.noise_px2)
 
     def derivatives(self, x_mm: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Of the projections at x (n, 3): by the points (n, m, 3) and by the model's parameters (n, m, p)."""
+        """Derivatives of the projections of x (n, 3) by the points (n, m, 3) and by the model's parameters (n, m, p)."""
         return self.minimum.state.evaluate(points(x_mm, 3, "x_mm"))[1:]
 
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Over the inliers: derivatives by points and parameters; inverse covariances and residuals, 0 in views not used."""
+        """Derivatives by points and by parameters, inverse covariances, residuals of the inliers; 0 in views not used."""
         _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
         J = J_x[:1] if self.minimum.state.model.is_affine else J_x
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
@@ -167,57 +167,61 @@ class Calibration:
         return J_x, J_c, weight, self.minimum.residuals
 
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
-        """(n, m, m) px^2 covariance of the projections of exact points, from the calibration's uncertainty alone."""
+        """(n, m, m) px^2: covariance of the projections of exact points, from the calibration's uncertainty alone."""
         J = self.derivatives(x_mm)[1]
         return J @ self.parameter_covariance @ np.swapaxes(J, 1, 2)
 
-    def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
-        """(n, 3, 3) mm^2 of triangulated points, from the calibration's own uncertainty and (`detection`) the detections'."""
+    def point_covariance(self, x_mm: ArrayLike, *, detection: bool | np.ndarray = True) -> np.ndarray:
+        """(n, 3, 3) mm^2 of triangulated points, from the calibration's uncertainty and that of the detections.
+
+        The latter is `noise_px2`, or a covariance (n, m, m) px^2; with False the detections are exact.
+        """
         J = self.pair.jacobian(x_mm)
         gain = np.linalg.solve(J.mT @ J, J.mT)  # the noise is the same in every pixel coordinate
-        return gain @ (self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)) @ np.swapaxes(gain, 1, 2)
+        noise_px2 = self.noise_px2 if detection is True else detection
+        return gain @ (self.projection_covariance(x_mm) + noise_px2) @ np.swapaxes(gain, 1, 2)
 
-    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:
-        """(n,) standard deviation along the mean viewing direction, for maps of the workspace."""
+    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool | np.ndarray = False) -> np.ndarray:
+        """(n,) standard deviation of triangulated points along the mean viewing direction, for maps of the workspace."""
         direction = sum(camera.viewing_direction for camera in self.cameras)
         direction = direction / np.linalg.norm(direction)
         return np.sqrt(np.einsum("i,nij,j->n", direction, self.point_covariance(x_mm, detection=detection), direction))
 
     @cached_property
     def leverage(self) -> np.ndarray:
-        """(inliers, m, m): by how much each inlier's own pixels move its projection."""
+        """(inliers, m, m): derivative of each inlier's projection by its own pixels."""
         _, J, weight, _ = self.system
         return J @ np.linalg.inv(self.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
 
     @cached_property
     def leave_one_out_px(self) -> np.ndarray:
-        """(inliers, m) residual of each inlier to the cameras fitted without it, exact for DLT; NaN in views not used."""
+        """(inliers, m) residuals of each inlier about the cameras fitted without it, exact for DLT; NaN in views not used."""
         r = self.system[3]
         r = np.linalg.solve(np.eye(r.shape[1]) - self.leverage, r[:, :, None])[:, :, 0]
         return np.where(np.repeat(self.view_inliers[self.inliers], 2, axis=1), r, np.nan)
 
     @property
     def press_rms_px(self) -> float:
-        """Cross-validated reprojection error: RMS distance in an image, each row predicted by the others."""
+        """Cross-validated reprojection error: RMS distance in an image, with each row predicted from the others."""
         return self._rms(self.leave_one_out_px)
 
     def _rms(self, r: np.ndarray) -> float:
-        """Of residuals (inliers, m) as distances in an image, over the views used."""
+        """RMS over the views used of the distances in an image, from residuals (inliers, m)."""
         views = self.view_inliers[self.inliers]
         return float(np.sqrt((r[np.repeat(views, 2, axis=1)] ** 2).sum() / views.sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """The pair as a piece of optics.
+    """Geometry of the stereo pair.
 
     Attributes:
-        mirrored: "no"; "left", "right", "left or right" (an odd number of reflections in one channel); "both"; "unknown":
-            only perspective can tell two cameras mirrored alike from unmirrored ones on the other side of the scene.
+        mirrored: "no"; "left", "right", "left or right" (an odd number of reflections in one channel); "both"; "unknown".
+            Only perspective can distinguish two mirrored cameras from two unmirrored ones on the other side of the scene.
         convergence_rad: Angle between the viewing directions (of the unmirrored pair).
         roll_rad: Rotation of the right image's content relative to the left's, x towards y.
         robot_from_microscope: Pose of the stereo head: x right in the mean image, z along the mean viewing direction,
-            origin where the image centres' rays come closest.
+            origin where the rays of the two image centres come closest to each other.
     """
 
     mirrored: str
@@ -227,11 +231,11 @@ class Optics:
 
 
 def optics(calibration: Calibration) -> Optics:
-    """Judge both channels together; a ValueError for a single camera, which cannot tell a mirror."""
+    """Derives the pair's geometry; a ValueError refuses a single camera, in which a mirror cannot be noticed."""
     rig = calibration.pair
     directions = np.stack([rig.left.viewing_direction, rig.right.viewing_direction])
     cosine = float(directions[0] @ directions[1])
-    # Where perspective is seen at three standard deviations; negative = mirrored.
+    # Signs of 1/distance where it is at least three standard deviations; negative = mirrored.
     distance, sd = calibration.inverse_distance_per_mm
     signs = np.sign([getattr(c, "inverse_distance_per_mm", 0.0) * (abs(distance) >= 3 * sd) for c in calibration.cameras])
     if cosine < 0:
@@ -256,11 +260,11 @@ def optics(calibration: Calibration) -> Optics:
 
 
 class OnlineCalibration:
-    """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
+    """Updates a calibration by new rows: an extended Kalman filter of the camera model's parameters.
 
-    It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
-    covariance, or the calibration's where it states none.  So it starts where the calibration ended, and the calibration's
-    noise levels judge the new rows.
+    The filter starts with the calibration's parameters and Fisher information.  A new row is weighted by its own covariance,
+    or by the calibration's noise level if it states none.  The robot's noise is the calibration's.  Views whose innovation
+    is too large for these covariances are not used.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -279,7 +283,7 @@ class OnlineCalibration:
         self._covariance = self._first = inverse(self._information)
 
     def add(self, data: Correspondences) -> np.ndarray:
-        """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
+        """Updates the cameras by the rows of a frame; returns the views (n, 2) bool that were used."""
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         pixels, noise = data.stacked_px, known.detection_covariance(data)
@@ -287,10 +291,10 @@ class OnlineCalibration:
         y, J_x, J = self._state.evaluate(x)
         r = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0)
         S = noise + variance_x * J_x @ J_x.mT
-        used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100, 2)  # the rig is uncertain itself
+        used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100, 2)  # with the rig's uncertainty
         if used.any():
             W = precision(S, used)
-            # The derivatives belong to the corrected points, as in `fit`: those of noisy ones would flatten the depth.
+            # Take the derivatives at the corrected points, as in `fit`; at the noisy points they would bias the depth.
             moved = variance_x * np.einsum("nij,nik,nk->nj", J_x, W, r)
             y, J_x, J = self._state.evaluate(x + moved)
             r = np.where(np.repeat(used, 2, axis=1), pixels - y + np.einsum("nij,nj->ni", J_x, moved), 0.0)
@@ -301,11 +305,11 @@ class OnlineCalibration:
         return used
 
     def remains(self, x_mm: np.ndarray) -> np.ndarray:
-        """(n,) of the variance of the calibration's projections of x_mm (n, 3), what the rows since then have left."""
+        """(n,) variance of the projections of x_mm (n, 3) now, divided by the variance from the calibration alone."""
         J = self._state.evaluate(x_mm)[2]
         now, first = (np.einsum("nip,pq,niq->n", J, known, J) for known in (self._covariance, self._first))
         return now / first
 
     def solve(self) -> StereoRig:
-        """The rig of the rows so far."""
+        """The rig estimated from all rows so far."""
         return StereoRig(*self._state.cameras())

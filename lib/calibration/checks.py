@@ -1,4 +1,4 @@
-"""What is refused before any fit: each check raises a `DataError` with the reason and the cure."""
+"""Plausibility checks before any fit: each raises a `DataError` with the reason and the cure."""
 
 from collections.abc import Sequence
 
@@ -9,15 +9,15 @@ from scipy.special import chndtrix
 from lib.correspondences import DataError
 from lib.geometry import finite_points
 
-#: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
+#: Plausible zooms (px per mm), from a room camera to the resolution of light; beyond them positions have the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
-#: The robot accuracy assumed where none is given (the paper's), for judging whether points are coplanar.
+#: The robot accuracy (the paper's) assumed where none is given, for judging whether points are coplanar.
 ROBOT_ACCURACY_MM = 0.010
-_NAMES = {1: ["u"], 2: ["u_left", "u_right"]}  # of the pixels of so many cameras
+_NAMES = {1: ["u"], 2: ["u_left", "u_right"]}  # number of cameras -> names of their pixels in messages
 
 
 def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
-    """x (n, 3) and the stacked pixels y (n, 2 cameras) of one or two cameras, finite and of one length, four at least."""
+    """x (n, 3) and the stacked pixels y (n, 2 or 4) of one or two cameras; checks that all are finite and n >= 4."""
     x = finite_points(x_mm, 3, "x_mm")
     u = [u] if isinstance(u, np.ndarray) and u.ndim == 2 else list(u)
     if len(u) not in _NAMES:
@@ -32,9 +32,9 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
 
 
 def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
-    """Refuse points thinner than points that truly are twice as thick as the robot is accurate look in one draw of 1e9.
+    """Refuse coplanar points: thinner than points of a true thickness of 2 sigma_x would look with a probability of 1e-9.
 
-    Few points may look thin by chance, so they pass and their covariance is large; `lib.trust` doubts what is thinner.
+    A few points may look thin by chance, so they pass; their covariance is large, and `lib.trust` doubts thin sets.
     """
     n, extent = len(x), extents(x)
     chance = np.sqrt(chndtrix(1e-9, max(n - 3, 1), 4.0 * n) / n)  # the thickness has a non-central chi-square distribution
@@ -53,16 +53,16 @@ def extents(x: np.ndarray) -> np.ndarray:
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:
-    """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres."""
+    """Refuse points that imply an impossible zoom: metres or micrometres given as millimetres."""
 
-    def extent(parts: Sequence[np.ndarray]) -> float:  # robust: a few gross rows must not look like another unit
+    def extent(parts: Sequence[np.ndarray]) -> float:  # robust: a few gross outliers must not look like another unit
         known = [part[np.isfinite(part).all(axis=1)] for part in parts]  # np.nanmedian is slow
         sizes = [np.median(np.abs(part - np.median(part, axis=0)), axis=0).max() for part in known]
         return float(max(sizes) or max(part.std(axis=0).max() for part in known))
 
     size = extent([x])
     if size <= 1e-9 * np.abs(x).max():
-        return  # no motion at all: `check_spread` says so
+        return  # no motion at all: `check_spread` refuses that
     zoom, (low, high) = extent(np.split(y, y.shape[1] // 2, axis=1)) / size, PLAUSIBLE_PX_PER_MM
     if zoom > high:
         raise DataError(f"x_mm: {zoom:.3g} px per mm is finer than light resolves; multiply metres by 1000.")
@@ -71,14 +71,14 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
 
 
 def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
-    """Refuse rows that repeat another row in every digit: they add no information and fake precision."""
+    """Refuse rows that repeat another row in every digit: they add no information but would lower the covariance."""
     repeated = len(x) - len({row.tobytes() for row in np.hstack([x, y])})  # np.unique of rows sorts them
     if repeated:
         raise DataError(f"x_mm, u: {repeated} of {len(x)} rows repeat another row; drop frames frozen or read twice.")
 
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
-    """Refuse pixels (n, m) that stand still or on a line in a camera, are the same in both, or leave the image."""
+    """Refuse pixels (n, m) that do not move or lie on a line in a camera, are the same in both, or leave the image."""
     names = _NAMES[y.shape[1] // 2]
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
         u = u[np.isfinite(u).all(axis=1)]
@@ -97,21 +97,21 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
 
 
 def sides(A: np.ndarray) -> tuple[float, float]:
-    """Where the right camera of A (4, 3) stands, along and across the image rows: rad of the angle between the two views."""
+    """Baseline from the left to the right camera of A (4, 3), along and across the image rows, as an angle in rad."""
     a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
     left, right = np.cross(a, b), np.cross(c, d)
-    apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)  # cameras stand against their viewing directions
+    apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)  # positions are opposite to viewing directions
     return apart @ (a + c) / 2, apart @ (b + d) / 2
 
 
 def eyes_exchanged(A: np.ndarray, sd_rad: float) -> bool:
-    """True where the left camera of a stereo head A (4, 3) stands on the right, beyond doubt.
+    """True if the left camera of a stereo head A (4, 3) is certainly on the right.
 
-    That is where the images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline runs
-    along the image rows, and its sign is five standard deviations `sd_rad` of the convergence from zero.
+    This needs images rotated by at most 30 degrees to each other, axes that converge by 1 to 30 degrees, a baseline within
+    34 degrees of the image rows, and one of the wrong sign by at least five standard deviations `sd_rad` of the convergence.
     """
     rows = A / np.linalg.norm(A, axis=1, keepdims=True)
     if (rows[:2] * rows[2:]).sum(axis=1).min() < np.cos(np.deg2rad(30)):
         return False
     along, across = sides(A)
-    return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad))
+    return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(1.5 * abs(across), 5.0 * sd_rad))

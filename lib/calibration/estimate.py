@@ -1,4 +1,4 @@
-"""`calibrate`: from correspondences to cameras with their covariance."""
+"""`calibrate`: cameras and their covariance from correspondences."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -22,14 +22,14 @@ from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
 from lib.parallel import single_threaded_blas
 
-#: Fewest rows with the tool's axes from which offsets are estimated unasked.
+#: Fewest rows with the tool's axes from which `offsets=None` estimates offsets.
 _OFFSET_ROWS = 12
-#: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.
+#: Turned axes are tried if the p-value of no offsets is below the first number, and landmarks move by more than the second.
 _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
-_NARROW = 0.05  # quantile of the jaws' opening, which offsets turn most
-#: Axes turn unless their log likelihood is lower by more than this.
+_NARROW = 0.05  # quantile of the distance between the tips: offsets turn the axes most where the tips are close
+#: Turned axes are preferred unless their log likelihood is lower by more than this.
 _AS_LIKELY = 3.0
-#: Standard deviations of 1/distance that show a finite distance: one of 2000 sets of affine cameras does; derivatives' step.
+#: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them); derivatives' step.
 _FINITE, _STEP_PER_MM = 3.0, 1e-6
 
 
@@ -41,36 +41,35 @@ def calibrate(
     sigma_x_mm: float | None = None, covariance_px2: ArrayLike | None = None,
     ransac_px: float | None = None, seed: int = 0, image_size_px: tuple[int, int] | None = None, checks: bool = True,
 ) -> Calibration:  # fmt: skip
-    """Cameras from robot positions and their detections: outliers out, then the exact minimum of Eq. (3).
+    """Cameras from robot positions and detections: removes outliers, then finds the exact minimum of Eq. (3).
 
-    Each camera finds the tightest consensus of its own detections, so a landmark that is lost in one image counts in the
-    other.  Noise levels are estimated from what agrees.  The covariances allow for that and, with `Correspondences`, for
-    errors that last from frame to frame (`Calibration.effective_rows`).
+    Outliers are found in each camera separately, so a landmark that is lost in one image is still used in the other.  Noise
+    levels are estimated from the inliers.  The covariances allow for that and, with `Correspondences`, for errors that are
+    correlated from frame to frame (`Calibration.effective_rows`).
 
     Args:
-        data, u: `Correspondences` alone (rows seen in one image count, too; covariances weigh the rows where all seen
-            landmarks have them); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
+        data, u: `Correspondences` alone (rows seen in only one image are used, too; their covariances weight the rows if all
+            seen landmarks have one); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
         offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
-            frames in which the robot reports three landmarks of open jaws, or in those of the landmarks where they are seen,
-            if offsets turn these and explain the detections as well (`LandmarkOffsets.turns`); "image": in the images, for a
-            detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 12 rows
-            and half of all allow it, else none.
-        offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
+            frames in which the robot reports three landmarks and open jaws.  The axes are those of the detected landmarks
+            instead, if offsets turn them and that explains the detections as well (`LandmarkOffsets.turns`).  "image": in the
+            images, for a constant error in pixels.  False: none.  None: "tool" if at least 12 rows and half of all have axes.
+        offset_prior_sd: Standard deviation of an offset's coordinate in the prior, mm or px; None = chosen by the data.
         model: "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or
             "+distances" (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
         weighting: "likelihood": Gaussian noise, inverse variances, exact projection.  "paper": Eq. (3) as printed, with
             weights 1/sigma and a reprojection term of unit weight (its result depends on the unit of length).
         sigma_u_px, sigma_x_mm: Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
-        covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.  Where
-            the residuals are larger than it says it is scaled up (unless sigma_u_px is given, too).
-        ransac_px: Largest reprojection distance of a detection that is used; None measures the noise and drops what is more
-            probably wrong than right, or would not appear once in 10 000 data sets; infinity keeps all.
-        seed: Of the random samples.
-        image_size_px: (width, height); the principal point of near-affine models is its centre, else the detections'.
+        covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.  It is
+            scaled up if the residuals are larger than it states (unless sigma_u_px is given, too).
+        ransac_px: Largest reprojection error of an inlier.  None estimates the noise and drops detections that are more
+            probably outliers than inliers, or whose error occurs in fewer than 1 of 10 000 data sets.  Infinity keeps all.
+        seed: Seed of the random samples.
+        image_size_px: (width, height); its centre is the principal point of near-affine models, else the detections' centre.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
-    A `NoConsensusError` (a ValueError) says that a camera's detections agree on no camera, or on two that no offsets
-    explain; a ValueError refuses rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
+    A `NoConsensusError` (a ValueError) is raised if the detections in an image fit no camera, or two cameras that no offsets
+    explain.  A ValueError refuses rows that determine no camera, offsets if too few rows have axes, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
@@ -109,7 +108,7 @@ def calibrate(
     if axes is None and offsets != "image":
         found = fitted(x, y)
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
-            # The covariance that an estimated noise level and errors correlated in time ask for.
+            # Allow for the estimated noise level and for errors correlated in time.
             _, J, weight, r = found.system
             order = () if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
             known, effective = sandwich(J, weight, r, *order)
@@ -121,22 +120,22 @@ def calibrate(
             found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
     if usable is None:
         return found
-    # An entry for every row given, usable or not.
+    # Insert the rows that are not usable, so that the results have one entry for each row of the data.
     fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
     if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
         fillers["covariance_px2"] = np.nan
     missing = np.flatnonzero(~usable)
-    places = missing - np.arange(len(missing))  # the usable rows before which they stand
+    places = missing - np.arange(len(missing))  # index of the usable row that follows
     return replace(found, **{name: np.insert(getattr(found, name), places, fill, axis=0) for name, fill in fillers.items()})
 
 
 def calibrate_as_shown(
     data: Correspondences, *, models: tuple[str, str] = ("zero_skew", "near_affine"), **options: object
 ) -> Calibration:  # fmt: skip
-    """`calibrate` with affine cameras, or with cameras of a finite distance where the detections show one.
+    """`calibrate` with affine cameras, or with cameras at a finite distance if the detections show a significant one.
 
-    They show one if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
-    deviations.  `models` names the affine cameras and those with a distance; other options and errors are `calibrate`'s.
+    It is significant if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
+    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.
 
     >>> from lib.simulator.rig import reference_rig
     >>> rng = np.random.default_rng(0)
@@ -148,7 +147,7 @@ def calibrate_as_shown(
     found = calibrate(data, model=models[0], **options)
     state, x = found.minimum.state, found.minimum.points
     far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
-    with suppress(DataError, np.linalg.LinAlgError):  # of rows that are too few for one number more
+    with suppress(DataError, np.linalg.LinAlgError):  # too few rows for one more parameter
         value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
         if value > _FINITE * sd:
             return calibrate(data, model=models[1], **options)
@@ -156,11 +155,11 @@ def calibrate_as_shown(
 
 
 def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Mask of the rows to calibrate with (seen in one view at least), and the tool's axes in them or None."""
+    """Mask of the rows to calibrate with (seen in at least one view), and the tool's axes in these rows or None."""
     if offsets not in (None, False, True, "tool", "image"):
         raise ValueError(f"offsets: expected 'tool', 'image', True, False or None, got {offsets!r}.")
     if offsets and weighting != "likelihood":
-        raise ValueError("weighting: offsets need the likelihood's weights.")
+        raise ValueError("weighting: offsets can only be estimated with weighting='likelihood'.")
     usable = data.seen.any(axis=1) & np.isfinite(data.x_mm).all(axis=1)
     if offsets not in (None, True, "tool") or weighting != "likelihood":
         return usable, None
@@ -178,10 +177,11 @@ def _turned(
     found: Calibration, estimate: Callable[..., Calibration], data: Correspondences, usable: np.ndarray, axes: np.ndarray, *,
     sure: bool,
 ) -> Calibration:  # fmt: skip
-    """The calibration with the axes of the moved landmarks, unless the reported ones explain the detections better.
+    """The calibration with the axes of the detected landmarks, unless those of the reported ones explain the data better.
 
-    What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
-    Offsets that turn the axes that much are more often the robot's than the detector's.  `sure`: somebody knows of offsets.
+    If the robot's model of the tool is wrong, its landmarks have constant offsets in the axes of the true tool, and the axes
+    computed from the reported landmarks are turned.  Large turns are more often errors of the robot than of the detector.
+    `sure`: the caller knows that there are offsets, so their p-value does not count.
     """
     x_mm = data.grid("x_mm")
     row = np.unique(data.frame, return_inverse=True)[1][usable]
@@ -191,7 +191,7 @@ def _turned(
         return np.where(np.isfinite(own), own, axes)
 
     opening = np.linalg.norm(x_mm[row, 2] - x_mm[row, 1], axis=1)
-    usual_mm = found.offsets.prior_sd**2 / np.quantile(opening, _NARROW)  # an offset, times the angle by which another turns
+    usual_mm = found.offsets.prior_sd**2 / np.quantile(opening, _NARROW)  # an offset times the angle that another one turns
     if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or usual_mm < _LEAST_TURN_MM:
         return found
     try:
@@ -201,12 +201,12 @@ def _turned(
             return found
         with warnings.catch_warnings(action="ignore", category=Unsettled):
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
-    except (DataError, np.linalg.LinAlgError):  # no cameras fit them
+    except (DataError, np.linalg.LinAlgError):  # no cameras fit the turned axes
         return found
     used = np.repeat(found.view_inliers | other.view_inliers, 2, axis=1)
-    most = 2 * found.reprojection_rms_px  # of a frame whose axes stay unknown more would say nothing
-    rms = [np.linalg.norm(np.clip(one.residuals_px[used], -most, most)) for one in (other, found)]
-    if used.sum() * np.log(rms[0] / rms[1]) > _AS_LIKELY:
+    most = 2 * found.reprojection_rms_px  # clipped: larger residuals are of frames with unknown axes
+    norm = [np.linalg.norm(np.clip(one.residuals_px[used], -most, most)) for one in (other, found)]
+    if used.sum() * np.log(norm[0] / norm[1]) > _AS_LIKELY:
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
 
@@ -216,14 +216,14 @@ def _calibrate(
     known: dict[str, float | None], ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
     views: np.ndarray | None = None,
 ) -> Calibration:  # fmt: skip
-    """`calibrate` of x (n, 3), y (n, m), NaN = not seen, `noise` (1 or n, m, m); `views` (n, cameras), which None finds."""
+    """`calibrate` of x (n, 3), y (n, m), NaN = not seen, `noise` (1 or n, m, m); inlier `views` (n, cameras), None = find."""
     n, m = y.shape
     plan = Model.parse(model, m // 2)
     if weighting not in ("likelihood", "paper"):
         raise ValueError(f"weighting: expected 'likelihood' or 'paper', got {weighting!r}.")
     for name, value in (*known.items(), ("ransac_px", ransac_px)):
         if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
-            raise ValueError(f"{name}: must not be negative, nor sigma_u_px zero, got {value}; None estimates it.")
+            raise ValueError(f"{name}: must not be negative, and sigma_u_px not zero, got {value}; None estimates it.")
     if np.isfinite(y).sum() < len(plan.parameter_names):
         raise DataError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():
@@ -255,14 +255,14 @@ def _calibrate(
         residuals = y - f
         if final:
             break
-        # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
-        new = view_distances2(residuals, scale**2 * claimed + sigma_x**2 * J @ J.mT) < gates  # NaN, not seen, is not below
-        if last or (new == views).all() or new.sum() < views.sum():  # those that the minimum is of
+        # An outlier under an affine camera and equal noise may be an inlier under the full model: test again with that.
+        new = view_distances2(residuals, scale**2 * claimed + sigma_x**2 * J @ J.mT) < gates  # False for NaN (not seen)
+        if last or (new == views).all() or new.sum() < views.sum():  # keep the views that the minimum was fitted to
             break
         views = new
 
     parameter_covariance = inverse(minimum.information)
-    if weighting == "paper":  # its weights are not the noise's: the sandwich H^-1 G H^-1
+    if weighting == "paper":  # its weights are not the inverse noise covariances: the sandwich H^-1 G H^-1
         variance_u, variance_x = paper_variances(sigma_u, sigma_x)
         _, J_x, J_c = minimum.state.evaluate(minimum.points)
         outer = J_x @ J_x.mT
@@ -281,8 +281,8 @@ def _calibrate(
         sd_rad = np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2))
         if refuse.eyes_exchanged(found.rig.linear, sd_rad):
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
-            what = f"the cameras are swapped, left stands on the right by {degrees:.1f} degrees"
-            cure = "exchange u_left and u_right (or flip both images, if mirrored; turn both, if upside down)"
+            what = f"the cameras are swapped, the left one is {degrees:.1f} degrees to the right of the right one"
+            cure = "exchange u_left and u_right (if mirrored flip both images, or one axis of x_mm; if upside down turn both)"
             raise DataError(f"u: {what}; {cure}.  checks=False takes them as they are.")
     return found
 
@@ -291,7 +291,7 @@ def _minimise(
     plan: Model, x: np.ndarray, y: np.ndarray, views: np.ndarray, noise: np.ndarray | None, weighting: str,
     known: dict[str, float | None], image_size_px: tuple[int, int] | None,
 ) -> tuple[Fit, tuple[float, float]]:  # fmt: skip
-    """The minimum over the views (n, cameras) bool, and the noise levels (sigma_u, sigma_x)."""
+    """The minimum for the inlier views (n, cameras) bool, and the noise levels (sigma_u, sigma_x)."""
     m, whole = y.shape[1], bool(views.all())
     used = np.repeat(views, 2, axis=1)
     if image_size_px is not None:

@@ -12,11 +12,11 @@ from lib.files import write_text
 
 
 def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
-    """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).
+    """Writes a file for `cv2.FileStorage`; the suffix .yml, .yaml, .xml or .json chooses the format (else a ValueError).
 
-    It holds `projection_matrix` (3 x 4, millimetres of the robot frame to pixels, the last row of an affine camera is
-    0 0 0 1), `image_width`, `image_height`, `unit_of_points`, and k = `radial_per_px2` with c = `distortion_centre`: what the
-    matrix projects to u is seen at u + k |u - c|^2 (u - c).
+    It holds `projection_matrix` (3 x 4, millimetres in the robot frame to pixels; the last row of an affine camera is
+    0 0 0 1), `image_width`, `image_height`, `unit_of_points`, and k = `radial_per_px2` with c = `distortion_centre`: a point
+    that the matrix projects to u is imaged at u + k |u - c|^2 (u - c).
 
     >>> import tempfile
     >>> from lib.cameras import AffineCamera
@@ -40,10 +40,10 @@ def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int
 
 
 def write_ros(camera: Camera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:
-    """ROS CameraInfo YAML (camera_info_manager).  P carries the whole camera, millimetres of the robot frame to pixels.
+    """Writes a ROS CameraInfo YAML (camera_info_manager).  P maps millimetres in the robot frame to pixels.
 
-    K and R are identities and D is zero: only P has a meaning.  A ValueError refuses a `name` of anything but letters, digits
-    and underscores, and radial distortion, which D cannot state without a focal length.
+    K and R are identities and D is zero: use only P.  A ValueError refuses a `name` that contains anything but letters,
+    digits and underscores, and radial distortion, which D cannot express without a focal length.
     """
     if not re.fullmatch(r"[A-Za-z0-9_]+", name):
         raise ValueError(f"name: ROS takes letters, digits and underscores, got {name!r}.")

@@ -1,7 +1,7 @@
-"""The ladder of camera models, their analytic Jacobians, and the constrained minimum of the same energy.
+"""The camera models, their analytic Jacobians, and the minimum of the energy under each model.
 
-A state moves by increments; every model is a selection matrix from its free parameters to the increments of all cameras,
-so one set of derivatives serves all.
+A step adds increments to a state.  Each model has a selection matrix from its free parameters to the increments of all
+cameras, so all models share the same derivatives.
 """
 
 from dataclasses import dataclass, replace
@@ -17,14 +17,14 @@ from lib.least_squares import minimise
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3))  # of every two unit vectors
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3))  # (3, 3, 3): cross products of all pairs of unit vectors
 
 
 @dataclass(frozen=True)
 class Model:
-    """A rung of the ladder for one or two cameras: a base and options joined by "+".
+    """A model of one or two cameras: a base and options joined by "+".
 
-    affine        8 numbers a camera
+    affine        8 parameters a camera
     zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
     square        one zoom a camera; 6
     common_zoom   one zoom for both; 11 a pair
@@ -39,7 +39,7 @@ class Model:
 
     @classmethod
     def parse(cls, name: str, cameras: int) -> Self:
-        """The model called `name`; a ValueError for an unknown one lists the known ones."""
+        """The model called `name`; a ValueError refuses an unknown name and lists the known ones."""
         base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
         if not known or {"distance", "distances"} <= set(options):
@@ -49,12 +49,12 @@ class Model:
 
     @property
     def is_affine(self) -> bool:
-        """True where the projection is linear in the points."""
+        """True if the projection is affine: no distance, no distortion."""
         return self.distance is None and not self.radial
 
     @cached_property
     def selection(self) -> np.ndarray:
-        """(cameras, increments of one, parameters), zeros and ones."""
+        """(cameras, increments a camera, parameters): 1 where a parameter moves an increment, else 0."""
         chosen = [[float(name == free) for free in self.parameter_names] for name in self._increment_names]
         return np.reshape(chosen, (self.cameras, -1, len(self.parameter_names)))
 
@@ -65,7 +65,7 @@ class Model:
 
     @cached_property
     def _increment_names(self) -> list[str]:
-        """A name for each increment of all cameras; increments of one name are tied, those without one are fixed."""
+        """The parameter of each increment of all cameras; increments with the same name are tied, those with "" are fixed."""
         if self.base == "affine":
             names = [f"a{r}{s} (px/mm)" for r in (1, 2) for s in (1, 2, 3)]
         else:
@@ -82,10 +82,10 @@ class State:
     """Cameras about a reference point: u = c + v (1 + k |v|^2), v = (A (x - x0) + o - c) / (1 + rho r3.(x - x0)).
 
     Attributes:
-        model: Whose parameters the state moves by and the derivatives are taken by.
-        A, offset: (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
-        rho, radial: (cameras,) 1/mm and 1/px^2.
-        reference, centre: x0 (3,) mm and c (cameras, 2) px, fixed.
+        model: Defines the parameters that steps and derivatives refer to.
+        A, offset: (cameras, 2, 3) px/mm, and o (cameras, 2), the pixel of the reference point.
+        rho, radial: (cameras,) 1/distance in 1/mm, and the distortion k in 1/px^2.
+        reference, centre: x0 (3,) mm and c (cameras, 2) px; both stay fixed.
     """
 
     model: Model
@@ -98,11 +98,11 @@ class State:
 
     @classmethod
     def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> Self:
-        """From affine cameras, `matrix` (2 cameras, 4), brought to the model's base."""
+        """A state from affine cameras, `matrix` (2 or 4, 4), constrained to the model's base."""
         A, zeros = matrix[:, :3].reshape(-1, 2, 3), np.zeros(model.cameras)
         offset = (matrix[:, :3] @ reference + matrix[:, 3]).reshape(-1, 2)
         if model.base != "affine":
-            # Polar factors: the orthonormal rows nearest to A's, whichever axis the skew came from.
+            # Polar decomposition: the orthonormal rows nearest to those of A; it favours neither image axis.
             left, sizes, right = np.linalg.svd(A, full_matrices=False)
             zoom = np.einsum("cij,cj,cij->ci", left, sizes, left)
             tied = {"zero_skew": (), "square": 1, "common_zoom": (0, 1)}[model.base]
@@ -111,24 +111,24 @@ class State:
 
     @cached_property
     def zoom(self) -> np.ndarray:
-        """(cameras, 2) px/mm, of bases other than affine."""
+        """(cameras, 2) px/mm, for bases other than affine."""
         return np.linalg.norm(self.A, axis=2)
 
     @cached_property
     def rotation(self) -> np.ndarray:
-        """(cameras, 3, 3), of bases other than affine: A = diag(zoom) rotation[:2]."""
+        """(cameras, 3, 3), for bases other than affine: A = diag(zoom) rotation[:2]."""
         rows = self.A / self.zoom[:, :, None]
         return np.concatenate([rows, cross(rows[:, :1], rows[:, 1:])], axis=1)
 
     @cached_property
     def normals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Unit normals r3 (cameras, 3) of the two rows of A, away from the camera, and their lengths (cameras,)."""
+        """Unit normals r3 (cameras, 3) to the rows of A, away from the camera, and the lengths |a1 x a2| (cameras,)."""
         normal = cross(self.A[:, 0], self.A[:, 1])
         size = np.linalg.norm(normal, axis=1)
         return normal / size[:, None], size
 
     def moved(self, step: np.ndarray) -> Self:
-        """The state after a step (p,) of the model's parameters."""
+        """The state after a step (p,) in the model's parameters."""
         d = self.model.selection @ step
         common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}
         if self.model.base == "affine":
@@ -137,7 +137,7 @@ class State:
         return replace(self, A=(self.zoom * np.exp(d[:, 3:5]))[:, :, None] * rotation[:, :2], **common)
 
     def cameras(self) -> tuple[Camera, ...]:
-        """The cameras of the public interface."""
+        """The state as camera objects of `lib.cameras`."""
         found = []
         for A, o, rho, k, c in zip(self.A, self.offset, self.rho, self.radial, self.centre, strict=True):
             M = np.column_stack([A, o - A @ self.reference])
@@ -160,7 +160,7 @@ class State:
         J_x = bend @ ((self.A - self.rho[:, None, None] * v[:, :, :, None] * r_3[:, None]) / ratio[:, :, :, None])
         if not derivatives:
             return y, J_x.reshape(n, 2 * c, 3), np.empty((n, 2 * c, 0))
-        # By the entries of A: d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|
+        # Derivatives by the entries of A: d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|
         flat = (x[:, None] - depth[:, :, None] * r_3) / size[:, None]
         turned = np.einsum("jks,crk->csrj", _CROSS, np.stack([self.A[:, 1], -self.A[:, 0]], axis=1)).reshape(c, 3, 6)
         dv = -self.rho[:, None, None] * v[:, :, :, None] * (flat[:, :, None] @ turned)  # x.(d r3)
@@ -178,7 +178,7 @@ class State:
         if self.model.base == "affine":
             return np.tile(np.eye(6).reshape(2, 3, 6), (c, 1, 1, 1))
         result = np.zeros((c, 2, 3, 5))
-        # A left increment turns R by delta x R.
+        # R <- exp(delta) R: the derivative of R is delta x R.
         result[..., :3] = self.zoom[:, :, None, None] * np.einsum("jkr,cks->crsj", _CROSS, self.rotation)[:, :2]
         result[:, 0, :, 3], result[:, 1, :, 4] = self.A[:, 0], self.A[:, 1]
         return result
@@ -198,9 +198,9 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum: the state, the energy `cost`, the corrected points x~ (n, 3), and what uncertainty needs.
+    """A minimum: the state, the energy `cost`, the corrected `points` x~ (n, 3), residuals and information.
 
-    The `residuals` (n, m) px are linearised, y - f(x~) - J (x - x~), so that their covariance is Sigma + v_x J J^T;
+    The `residuals` (n, m) px are linearised, y - f(x~) - J (x - x~), so that their covariance is Sigma + v_x J J^T.
     `information` (p, p) is the Gauss-Newton Hessian in the model's parameters.
     """
 
@@ -215,7 +215,7 @@ class Fit:
 def settle(
     state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Best corrected points of a state: cost, linearised residuals (zero in views not used), x~, S^-1."""
+    """The corrected points x~ that minimise a state's energy: cost, linearised residuals (0 in unused views), x~, S^-1."""
     points, linear = x, state.model.is_affine
     for _ in range(1 if linear or variance_x == 0 else 4):
         f, J, _ = state.evaluate(points, derivatives=False)
@@ -230,8 +230,8 @@ def settle(
 def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
-    Eliminating every point exactly leaves residuals of covariance S = noise + variance_x J J^T and a system in the camera
-    parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only `views` (n, cameras) count.
+    Eliminating every point exactly gives residuals of covariance S = noise + variance_x J J^T and a system in the camera
+    parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; `views` (n, cameras) bool are used.
     """
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
@@ -242,12 +242,12 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
         return (cost, work) if np.isfinite(cost) else None
 
     def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
-        r, settled, weight = work
-        J = state.evaluate(settled)[2]
+        r, corrected, weight = work
+        J = state.evaluate(corrected)[2]
         WJ = (weight @ J).reshape(-1, J.shape[2])
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
-    with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
-        # What 1e-10 of the energy leaves open is a ten-thousandth of a deviation.
+    with np.errstate(all="ignore"):  # a first step may be so long that its energy is not finite; it is then shortened
+        # With a tolerance of 1e-10 the error is about a ten-thousandth of a standard deviation.
         found = minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)
     return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)

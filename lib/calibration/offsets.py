@@ -1,9 +1,9 @@
 """Constant offsets of the landmarks, estimated along with the cameras.
 
-What a detector marks may lie some hundredths of a millimetre beside the landmark, always in the same direction of the tool,
-and such an error does not average out.  With the robot's landmark k at x and the tool's axes R, the marked point is
-x + R d_k.  The data cannot tell all nine numbers d from a shift of the cameras, so they have a Gaussian prior of zero mean,
-whose width the data choose (empirical Bayes).  What the data cannot tell stays in the covariance.
+The point that a detector finds may be some hundredths of a millimetre from the landmark, always in the same direction of the
+tool.  Such an error does not average out.  If the robot reports landmark k at x and the tool has the axes R, the point found
+is x + R d_k.  The data cannot distinguish all nine numbers d from a shift of the cameras, so d has a Gaussian prior of zero
+mean, whose width the data choose (empirical Bayes).  Directions that the data do not determine keep a large covariance.
 """
 
 import warnings
@@ -24,35 +24,35 @@ from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import cross
 
-#: Step of the offsets' derivatives, mm or px.
+#: Step of the numerical derivatives by the offsets, mm or px.
 _STEP = 1e-4
-#: Largest offset, from the mean of all, that may explain two cameras, and largest one that may explain a landmark which
-#: agrees with no camera of the others: what is farther off is another point of the tool.
+#: Largest offset (from the mean of all) that may explain two competing cameras, and largest offset that may explain a single
+#: landmark that is an outlier for the others' cameras.  Beyond these the detector finds another point of the tool.
 _MOST_MM, _MOST_ALONE_MM = 0.8, 0.25
-#: So many first steps use every detection; later ones drop those that fit another camera.
-_TAKEN = 4
-#: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
+#: Number of first steps that use every detection, if cameras compete; later steps use the inliers.
+_WITH_ALL = 4
+#: Grid of initial offsets that turn the axes (a robot's model of its tool errs by tenths of a millimetre), and rows used.
 _GRID_MM, _STARTING_ROWS = (0.0, 0.2, -0.2), 2000
-#: How many starts take more steps, how often rows are weighed anew for a step, and the gain in cost of the last step.
-_POLISHED, _REWEIGHTED, _SETTLED = 4, 3, 0.1
-#: Standard deviation of a detector's own constant error, as a share of the tool's length: of base and tips, along, across and
-#: normal to it.  Chosen by recordings of unfamiliar tools and lights.
+#: Number of initial values that are refined, reweightings of the rows in a step, and decrease of the cost that ends them.
+_REFINED, _REWEIGHTED, _SETTLED = 4, 3, 0.1
+#: Standard deviation of the detector's constant error in units of the tool's length: base and tips; along, across and normal
+#: to the tool.  Chosen on recordings of unfamiliar tools and lights.
 OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
-_ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
-#: The tool's axes (n, 3, 3) in the rows; of offsets (..., landmarks, 3), if these turn them, (..., n, 3, 3); or none.
+_ODD = 0.2  # share of a large offset that may still be the detector's: it knows some tools far worse than others
+#: The tool's axes (n, 3, 3) in each row; or a function from offsets (..., k, 3) to the axes (..., n, 3, 3); None: no axes.
 Axes = np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
 class Unsettled(RuntimeWarning):
-    """Offsets still move after all steps that they are given."""
+    """The offsets have not converged after the given number of steps."""
 
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
-    """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
+    """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm.  Columns: along the tool, from tip to tip, their normal.
 
-    With `offset_mm` (..., 1 to 3, 3), the axes (..., n, 3, 3) of the landmarks moved by it in these same axes.  Tips that are
-    reported crossed leave two; those that turn least from row to row count, so the rows must be in order of time.
-    NaN where the tips are reported closer than 5 % of the tool's length, or a landmark is missing.
+    With `offset_mm` (..., 1 to 3, 3), the axes (..., n, 3, 3) of the moved landmarks; the offsets are in these same axes.  If
+    the reported tips may be crossed there are two solutions; the one that turns least from row to row is taken, so rows must
+    be in order of time.  NaN where the tips are closer than 5 % of the tool's length, or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -71,8 +71,8 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         g = cross(m, c)
         if offset_mm is None:
             return np.where((width > 0.05 * size[:, None])[:, :, None], np.stack([m, c, g], axis=2), np.nan)
-        # In the tool's axes the reported vector along the tool is known but for its length; so is the height, along the
-        # normal, of the one from tip to tip.  Together they are all three angles.
+        # In the wanted axes the direction `a` of the reported vector along the tool is known, and the component along the
+        # normal of the reported vector from tip to tip.  Together they determine all three angles.
         base, tip_1, tip_2 = (*np.moveaxis(offset_mm[..., None, :], -3, 0), np.zeros(3), np.zeros(3))[:3]  # (..., 1, 3)
         middle, apart = (tip_1 + tip_2) / 2 - base, tip_2 - tip_1
         straight = np.sqrt(size**2 - middle[..., 1] ** 2 - middle[..., 2] ** 2)
@@ -89,35 +89,34 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         shut = 0.05 * (straight + middle[..., 0])
         possible = (width[:, 0] > shut) & (opening > np.stack([np.full(shut.shape, -np.inf), -shut]))  # jaws hardly cross
     found = np.where(possible[0, ..., None, None], axes[0], np.where(possible[1, ..., None, None], axes[1], np.nan))
-    for of_one in np.argwhere(possible.all(axis=0).any(axis=-1)).tolist():
-        one = (slice(None), *of_one)
-        _choose_least_turning(axes[one], possible[one], found[one[1:]])
+    for index in np.argwhere(possible.all(axis=0).any(axis=-1)).tolist():
+        _choose_least_turning(axes[:, *index], possible[:, *index], found[*index])
     return found
 
 
 def _choose_least_turning(axes: np.ndarray, possible: np.ndarray, found: np.ndarray) -> None:
-    """Where two axes (2, n, 3, 3) are `possible` (2, n), write those that turn least into those `found` (n, 3, 3)."""
+    """Where both axes (2, n, 3, 3) are `possible` (2, n), write those that turn least into `found` (n, 3, 3), in place."""
     known = np.flatnonzero(possible.any(axis=0))
     two = np.concatenate([[False], possible[:, known].all(axis=0), [False]])
-    known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter
+    known = known[two[:-2] | two[1:-1] | two[2:]]  # rows with two choices and their neighbours; the others are fixed
     y = axes[..., 1][:, known]
     own = np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
     turn = np.nan_to_num(1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:]), nan=np.inf).tolist()
-    (a, b), came = own[:, 0].tolist(), []
-    for ((aa, ab), (ba, bb)), (own_a, own_b) in zip(turn, own.T[1:].tolist(), strict=True):  # the shortest way to each
-        came.append((a + aa > b + ba, a + ab > b + bb))
+    (a, b), previous = own[:, 0].tolist(), []  # dynamic programming: the least cost of paths that end in choice a or b
+    for ((aa, ab), (ba, bb)), (own_a, own_b) in zip(turn, own.T[1:].tolist(), strict=True):
+        previous.append((a + aa > b + ba, a + ab > b + bb))
         a, b = min(a + aa, b + ba) + own_a, min(a + ab, b + bb) + own_b
     which = [b < a]
-    for step in reversed(came):
-        which.append(step[which[-1]])
+    for choice in reversed(previous):
+        which.append(choice[which[-1]])
     found[known] = axes[np.array(which[::-1], int), known]
 
 
 def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, carry: bool = False) -> np.ndarray:
-    """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows.
+    """`tool_axes` (n, 3, 3) of each row's frame.  All NaN if a landmark of a frame occurs twice, as in joined recordings.
 
-    Where the landmarks moved by `offset_mm`, of one to three landmarks, have no axes, those of the reported ones; before
-    that, if `carry`, those `carried` from another frame.
+    With `offset_mm` (1 to 3, 3), the axes of the moved landmarks, or those of the reported landmarks where these have none.
+    If `carry`, both are first filled by axes `carried` from other frames.
     """
     if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(3 * data.frame + data.landmark)) < len(data):
         return np.full((len(data), 3, 3), np.nan)
@@ -132,15 +131,15 @@ def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, car
 
 
 def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None) -> np.ndarray:
-    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3), in order of time; NaN ones are taken from the nearest row with axes.
+    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3), in order of time; NaN ones are filled from the nearest row with axes.
 
-    They are turned as the shaft turned: shut jaws tell where the shaft points, and not how it is rolled.  The nearest row is
-    that in time, or without `time_s` in order.
+    The axes of that row are turned as the shaft turned since: shut jaws show where the shaft points, but not its roll.
+    The nearest row is the nearest in time, or without `time_s` in order.
     """
     along = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
     found, time = axes.copy(), np.arange(len(axes)) if time_s is None else time_s
-    is_known, is_told = np.isfinite(axes).all(axis=(1, 2)), np.isfinite(along).all(axis=1)
-    known, shut = np.flatnonzero(is_known & is_told), np.flatnonzero(~is_known & is_told)
+    has_axes, is_reported = np.isfinite(axes).all(axis=(1, 2)), np.isfinite(along).all(axis=1)
+    known, shut = np.flatnonzero(has_axes & is_reported), np.flatnonzero(~has_axes & is_reported)
     if known.size and shut.size:
         nearest = known[np.searchsorted((time[known[1:]] + time[known[:-1]]) / 2, time[shut])]
         axis = cross(along[nearest], along[shut])
@@ -151,14 +150,14 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
 
 
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:
-    """The rows with their landmarks where the detector sees them, as far as `Calibration.offsets` has learnt it.
+    """The correspondences with the `Calibration.offsets` applied, so that positions and detections agree.
 
-    Offsets in the tool's axes move positions, those of shut jaws by the axes of the nearest frame with open ones (`carried`);
-    offsets in the images move pixels; None nothing.
+    Offsets in the tool's axes move positions; those of shut jaws use the axes of the nearest frame with open jaws
+    (`carried`).  Offsets in the images move pixels.  None changes nothing.
     """
     if offsets is None:
         return data
-    unknown = max(data.landmark.max(initial=0) + 1 - len(offsets.offset), 0)  # landmarks that no image showed
+    unknown = max(data.landmark.max(initial=0) + 1 - len(offsets.offset), 0)  # landmarks never seen in the calibration
     shift = np.vstack([offsets.offset, np.zeros((unknown, offsets.offset.shape[1]))])[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
@@ -167,15 +166,15 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 
 def robots_part(found: LandmarkOffsets, own_sd_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the offsets (3, 3) mm that is the robot's, and its covariance (3, 3, 3); the rest is the detector's error.
+    """The robot's part of the offsets (3, 3) mm, and its covariance (3, 3, 3); the rest is the detector's error.
 
-    Both have Gaussian priors: the detector's of `own_sd_mm` (3, 3), the robot's of the width that makes the nine numbers most
-    probable.  Offsets no larger than a detector's usual errors are taken for the detector's.
+    Both parts have Gaussian priors: the detector's of standard deviations `own_sd_mm` (3, 3), the robot's of the one that
+    makes the nine numbers most probable.  Offsets no larger than a detector's usual errors are attributed to the detector.
     """
     widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
     total = widths**2 + own_sd_mm**2 + found.standard_deviation**2
     width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
-    # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
+    # A shift of cameras and offsets together changes no label, so its large covariance is no reason for a smaller share.
     share = width**2 / (width**2 + own_sd_mm**2)
     variance = share * own_sd_mm**2 + (_ODD * share * found.offset) ** 2
     return share * found.offset, variance[:, :, None] * np.eye(3)
@@ -187,12 +186,12 @@ def estimate_offsets(
 ) -> Calibration:  # fmt: skip
     """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
 
-    Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
-    pixels (n, m) with the `views` to use, and one Schur complement; an `Unsettled` warning where `iterations` are too few.
-    `start` gives the first offsets, their prior and p-value.  Without `prior_sd` it is the one that makes the data most
-    probable, 0.1 to 300 um or 0.01 to 30 px.
-    Where rows agree loosely or two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may
-    explain it; else the `NoConsensusError`, or the calibration without that landmark, stays.
+    Gauss-Newton on the offsets with the cameras eliminated.  A step makes a whole calibration `fit` of positions (n, 3) and
+    pixels (n, m), with inlier `views`, and a Schur complement.  An `Unsettled` warning says that `iterations` are too few.
+    `start` gives the first offsets, their prior and p-value.  Without `prior_sd` the prior's width is the one of maximum
+    evidence, between 0.1 and 300 um or 0.01 and 30 px.
+    If rows agree only loosely, two cameras compete, or one landmark is mostly an outlier, small offsets may be the reason.
+    Else the `NoConsensusError` is raised, or the calibration without that landmark returned.
     """
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
@@ -205,7 +204,7 @@ def estimate_offsets(
     if found is not None and _agree_alike(found, landmark):
         return found
     with suppress(DataError, np.linalg.LinAlgError, Unsettled), warnings.catch_warnings(action="error", category=Unsettled):
-        other = steps(taken=_TAKEN)
+        other = steps(with_all=_WITH_ALL)
         offset = other.offsets.offset[np.bincount(landmark) > 0]
         most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
         if np.linalg.norm(offset - centre, axis=1).max() <= most and _agree_alike(other, landmark):
@@ -216,7 +215,7 @@ def estimate_offsets(
 
 
 def _agree_alike(found: Calibration, landmark: np.ndarray) -> bool:
-    """Whether the cameras hold for each landmark that is seen, and not for some far more often than for others."""
+    """True if no landmark's share of inliers is below half of the largest landmark's share."""
     count = np.bincount(landmark)
     shares = np.bincount(landmark, found.inliers)[count > 0] / count[count > 0]
     return bool(shares.min() >= 0.5 * shares.max())
@@ -224,9 +223,9 @@ def _agree_alike(found: Calibration, landmark: np.ndarray) -> bool:
 
 def _steps(
     fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
-    axes: Axes, prior_sd: float | None, iterations: int, start: Calibration | None, *, taken: int = 0,
+    axes: Axes, prior_sd: float | None, iterations: int, start: Calibration | None, *, with_all: int = 0,
 ) -> Calibration:  # fmt: skip
-    """`estimate_offsets`; the first steps, as many as `taken`, use every detection, though they look like two cameras'."""
+    """The Gauss-Newton steps of `estimate_offsets`; the first `with_all` of them use every detection, outliers too."""
     offset = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3))
     p_value, views = np.nan, None
     if start is not None:
@@ -236,12 +235,12 @@ def _steps(
     for i in range(iterations):
         own = axes(offset) if callable(axes) else np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes
         shift = np.einsum("nij,nj->ni", own, offset[landmark])
-        if i < taken:
+        if i < with_all:
             views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
         found = fit(*((x, y - shift) if axes is None else (x + shift, y)), views=views)
-        # Outliers that come and go from step to step would be no end; where other axes of rows were chosen they are new.
-        settled = i >= taken + 2 or (i > taken and np.array_equal(found.view_inliers, before_inliers))
-        views = found.view_inliers if settled and found.reprojection_rms_px < 1.2 * before_px else None
+        # Keep the inliers after a few steps, else they may alternate for ever; find them anew if other axes raise the error.
+        keeps = i >= with_all + 2 or (i > with_all and np.array_equal(found.view_inliers, before_inliers))
+        views = found.view_inliers if keeps and found.reprojection_rms_px < 1.2 * before_px else None
         before_px, before_inliers = found.reprojection_rms_px, found.view_inliers
         rows = found.inliers
         J_x, J_c, weight, r = found.system
@@ -253,10 +252,10 @@ def _steps(
             prior_sd = prior_sd or chosen_sd
         covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
         before, step = step, covariance @ (gradient - offset.ravel() / prior_sd**2)
-        share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # to and fro: it went too far
+        share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # shorten steps that reverse their direction
         offset = offset + share * step.reshape(offset.shape)
         moved, least_sd = share * np.abs(step).max(), np.sqrt(np.diag(covariance).min())
-        if moved < 1e-3 * least_sd and i >= taken:
+        if moved < 1e-3 * least_sd and i >= with_all:
             break
     else:
         if moved > 0.1 * least_sd:
@@ -271,7 +270,7 @@ def _steps(
 
 
 def _without_cameras(J: np.ndarray, J_c: np.ndarray, weight: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information (p, p) and gradient (p,) of offsets with derivatives J (n, m, p), where the cameras, with J_c, are free."""
+    """Information (p, p) and gradient (p,) of offsets with derivatives J (n, m, p), after eliminating the cameras (J_c)."""
     both, p = np.concatenate([J_c, J], axis=2), J_c.shape[2]
     weighted = (weight @ both).reshape(-1, both.shape[2])
     information, gradient = weighted.T @ both.reshape(weighted.shape), weighted.T @ r.ravel()
@@ -282,13 +281,13 @@ def _without_cameras(J: np.ndarray, J_c: np.ndarray, weight: np.ndarray, r: np.n
 def start_of_turning(
     found: Calibration, axes: np.ndarray, turned: Callable[[np.ndarray], np.ndarray], landmark: np.ndarray
 ) -> np.ndarray:
-    """Offsets (k, 3) from which to estimate those that turn the axes; of many starts the one that explains most.
+    """Initial offsets (k, 3) for estimating offsets that turn the axes: the best of a grid, refined.
 
-    Offsets turn the axes by three numbers (`_turns`).  At each point of a grid of them the others follow linearly, and
-    Gauss-Newton steps lead on from the best.  `found` is the calibration by the reported `axes` (n, 3, 3), `turned` gives
-    the axes of offsets.
+    Three linear combinations of the offsets turn the axes (`_turns`).  At each point of a grid over these three, the other
+    offsets follow from a linear problem; Gauss-Newton steps refine the best points.  `found` is the calibration with the
+    reported `axes` (n, 3, 3), and `turned` maps offsets to axes.
     """
-    some = np.random.default_rng(0).permutation(found.inliers.sum())[:_STARTING_ROWS]  # every third would be one landmark
+    some = np.random.default_rng(0).permutation(found.inliers.sum())[:_STARTING_ROWS]  # random rows, of all landmarks
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
     landmark, (turns, along), p = landmark[rows], _turns(k), J_c.shape[2]
@@ -298,37 +297,37 @@ def start_of_turning(
     def of_rows(offset: np.ndarray) -> np.ndarray:
         return turned(offset)[..., rows, :, :]
 
-    def from_here(offset: np.ndarray, own: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-        """How badly offsets explain the detections, with the cameras free, and where a Gauss-Newton step leads.
+    def gauss_newton(offset: np.ndarray, own: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+        """The cost of offsets, with the cameras eliminated, and the offsets after a Gauss-Newton step.
 
-        The step leaves the turn as it is where the axes are given as their `own`.  Rows whose axes stay wrong are far off,
-        and count little: the noise is Student's, of 4 degrees of freedom.
+        If the axes are given as `own`, the step does not turn them.  The noise is Student's t of 4 degrees of freedom, so
+        rows with wrong axes, whose residuals are large, have little weight.
         """
         held, own = own is not None, of_rows(offset) if own is None else own
-        left = r - (J_x @ own @ offset[landmark][:, :, None])[:, :, 0]
+        residual = r - (J_x @ own @ offset[landmark][:, :, None])[:, :, 0]
         J = np.concatenate([J_c, J_x @ _by_offset(None if held else of_rows, offset, landmark, own)], axis=2)
-        flat, weighted, likely = J.reshape(-1, J.shape[2]), (weight @ J).reshape(-1, J.shape[2]), np.ones(len(r))
+        flat, weighted, robust = J.reshape(-1, J.shape[2]), (weight @ J).reshape(-1, J.shape[2]), np.ones(len(r))
         for _ in range(_REWEIGHTED):
-            now = weighted * np.repeat(likely, r.shape[1])[:, None]
-            information, gradient = now.T @ flat, now.T @ left.ravel()
-            rest = left - J_c @ np.linalg.solve(information[:p, :p], gradient[:p])
+            now = weighted * np.repeat(robust, r.shape[1])[:, None]
+            information, gradient = now.T @ flat, now.T @ residual.ravel()
+            rest = residual - J_c @ np.linalg.solve(information[:p, :p], gradient[:p])
             r2 = (rest * (weight @ rest[:, :, None])[:, :, 0]).sum(axis=1)
             median = max(np.median(r2), 1e-12)
-            likely = 1 / (1 + r2 / median)
+            robust = 1 / (1 + r2 / median)
         information[p:, p:] += prior + held * 1e3 * np.trace(information) * turns.T @ turns
         step = np.linalg.solve(information, gradient - np.append(np.zeros(p), prior @ offset.ravel()))[p:]
         cost = len(r) * np.log(median) + 2 * np.log1p(r2 / median).sum()
         return float(cost), offset + step.reshape(offset.shape)
 
     starts = []
-    for few in np.split(np.tensordot(list(product(_GRID_MM, repeat=3)), along, 1), 9):  # all at once take much memory
-        few = np.stack([from_here(*one)[1] for one in zip(few, of_rows(few), strict=True)])
-        starts += [(from_here(*one)[0], one[0]) for one in zip(few, of_rows(few), strict=True)]
+    for few in np.split(np.tensordot(list(product(_GRID_MM, repeat=3)), along, 1), 9):  # all at once need much memory
+        few = np.stack([gauss_newton(*one)[1] for one in zip(few, of_rows(few), strict=True)])
+        starts += [(gauss_newton(*one)[0], one[0]) for one in zip(few, of_rows(few), strict=True)]
     best = min(starts, key=lambda start: start[0])
-    for _, offset in sorted(starts, key=lambda start: start[0])[:_POLISHED]:
-        (cost, to), share = from_here(offset), 1.0
+    for _, offset in sorted(starts, key=lambda start: start[0])[:_REFINED]:
+        (cost, to), share = gauss_newton(offset), 1.0
         for _ in range(10):
-            new = from_here(offset + share * (to - offset))
+            new = gauss_newton(offset + share * (to - offset))
             if new[0] > cost:
                 share /= 2
                 continue
@@ -341,9 +340,9 @@ def start_of_turning(
 
 
 def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The three numbers of offsets (k, 3) that turn the axes, as rows (3, 3 k), and offsets (3, k, 3) of one of each.
+    """The three linear combinations of offsets (k, 3) that turn the axes: rows (3, 3 k), and offsets (3, k, 3) of one each.
 
-    They are where the tips' middle lies beside and above the base, and by how much tip_2 lies above tip_1.
+    They are the shift of the tips' middle relative to the base, across and normal, and of tip_2 relative to tip_1, normal.
     """
     rows = [[0, -1, 0, 0, 0.5, 0, 0, 0.5, 0], [0, 0, -1, 0, 0, 0.5, 0, 0, 0.5], [0, 0, 0, 0, 0, -1, 0, 0, 1]]
     rows = np.array(rows)[:, : 3 * k]
@@ -351,7 +350,7 @@ def _turns(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _by_offset(axes: Axes, offset: np.ndarray, landmark: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(n, m, k m): derivatives of the shifts (n, m) of rows by offsets (k, m), which turn the axes `own` as `axes` say."""
+    """(n, m, k m): derivatives of the rows' shifts (n, m) by offsets (k, m); a function `axes` makes the axes `own` turn."""
     k, m = offset.shape
     J = np.einsum("nij,nk->nikj", own, np.eye(k)[landmark]).reshape(-1, m, k * m)
     if callable(axes):
@@ -362,9 +361,9 @@ def _by_offset(axes: Axes, offset: np.ndarray, landmark: np.ndarray, own: np.nda
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:
-    """The prior's standard deviation, `least` to 3000 times that, of greatest evidence (the offsets integrated out).
+    """The prior's standard deviation (`least` to 3000 times that) of maximum evidence, and the p-value of no offsets.
 
-    And the p-value of no offsets, in the directions that the data know better than to 500 times `least`.
+    The p-value is that of a score test in the directions whose standard deviation is below 500 times `least`.
     """
     values, vectors = np.linalg.eigh(information)
     along, candidates = (vectors.T @ gradient) ** 2, least * np.geomspace(1, 3000, 60)
@@ -376,9 +375,9 @@ def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tu
 
 
 def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float]:
-    """One more parameter of the calibration `found` of `data`: its value, so far taken for 0, and its standard deviation.
+    """Estimates one more parameter, 0 so far, of the calibration `found` of `data`: its value and standard deviation.
 
-    It is one Gauss-Newton step of cameras, offsets and it together; `column` (inliers, m) is the pixels' derivative by it.
+    One Gauss-Newton step in it, cameras and offsets together; `column` (inliers, m) is the derivative of the pixels by it.
     """
     rows, learnt = data.subset(found.inliers), found.offsets
     J_x, J_c, weight, r = found.system

@@ -1,4 +1,4 @@
-"""Tool offsets: where a landmark sits in the tool's own frame, for robots that report a pose and no landmarks."""
+"""Tool offsets: positions of the landmarks in the tool's frame, for robots that report a pose and no landmarks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from lib.calibration.affine import regress
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 
-_TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of the robot's noise then leave 0.5 mm / sqrt(poses)
-_OPENING = 0.03  # least range of half the opening (rad): 100 um at the end of a jaw of 3 mm
-_LARGEST_SD_MM = 1.0  # of an offset's coordinate; beyond it the motion determines nothing
+_TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of robot noise then give an sd of 0.5 mm / sqrt(poses)
+_OPENING = 0.03  # least range of half the opening (rad): it moves the end of a 3 mm jaw by 100 um
+_LARGEST_SD_MM = 1.0  # largest standard deviation of an offset's coordinate; above it the offset counts as undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, (6, 6) covariance of both, RMS."""
+    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, their (6, 6) covariance, the RMS."""
 
     offset_mm: np.ndarray
     point_mm: np.ndarray
@@ -28,11 +28,11 @@ class Pivot:
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """Landmarks in the tool frame, at a full angle o between the jaws: offset + sin(o / 2) sine + (1 - cos(o / 2)) versine.
+    """Landmarks in the tool frame, at the full angle o between the jaws: offset + sin(o / 2) sine + (1 - cos(o / 2)) versine.
 
     Attributes:
-        offset_mm: (k, 3) where the landmarks are when the jaws are closed.
-        sine_mm, versine_mm: (k, 3) how they turn as the jaws open; 0 for a fixed landmark.
+        offset_mm: (k, 3) positions of the landmarks when the jaws are closed.
+        sine_mm, versine_mm: (k, 3) coefficients of their motion as the jaws open; 0 for a fixed landmark.
     """
 
     offset_mm: np.ndarray
@@ -43,9 +43,9 @@ class Tool:
     def hinged(
         cls, offset_mm: ArrayLike, turning: ArrayLike, point_mm: ArrayLike, axis: ArrayLike, jaw_mm: ArrayLike
     ) -> Self:
-        """From a hinge: an axis through a point, and the vector from there to the tips of the closed jaws.
+        """A tool with a hinge: an axis through `point_mm`, and the vector `jaw_mm` from there to the tips of the closed jaws.
 
-        `turning` (k,) is 1 for a landmark that turns with the axis, -1 against it, 0 for one at its `offset_mm` (k, 3).
+        `turning` (k,) is 1 for a landmark that turns positively about the axis, -1 negatively, 0 if fixed at its `offset_mm`.
 
         >>> tool = Tool.hinged(np.zeros((3, 3)), [0, 1, -1], [0, 0, 0], [0, 0, 1], [3, 0, 0])
         >>> tool.positions_mm([RigidTransform.identity()], [np.pi / 3])[0].round(2).tolist()
@@ -60,7 +60,7 @@ class Tool:
         return cls(offset, side * np.cross(axis, jaw), -np.abs(side) * (jaw - axis * (axis @ jaw)))
 
     def positions_mm(self, robot_from_tool: Sequence[RigidTransform], opening_rad: ArrayLike | None = None) -> np.ndarray:
-        """(n, k, 3) landmark positions in the robot frame at the poses: what `calibrate` and a recording want."""
+        """(n, k, 3) landmark positions in the robot frame at the poses, as `calibrate` and recordings need them."""
         half = np.zeros(len(robot_from_tool)) if opening_rad is None else np.asarray(opening_rad, np.float64) / 2
         turn = np.sin(half)[:, None, None] * self.sine_mm + (1 - np.cos(half))[:, None, None] * self.versine_mm
         return np.stack([pose.apply(x) for pose, x in zip(robot_from_tool, self.offset_mm + turn, strict=True)])
@@ -68,7 +68,7 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class ToolOffsets(Tool):
-    """A tool that was estimated: with the covariance of `offset_mm`, (k, 3, 3) mm^2, and the cameras found with it."""
+    """An estimated tool, with the covariance of `offset_mm`, (k, 3, 3) mm^2, and the cameras estimated together with it."""
 
     covariance_mm2: np.ndarray
     cameras: tuple[AffineCamera, ...]
@@ -76,9 +76,9 @@ class ToolOffsets(Tool):
 
 
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
-    """Classical pivot calibration: the tip rests in one point while the tool turns, R_i p + t_i = c.
+    """Classical pivot calibration: the tip rests at one point c while the tool turns, R_i p + t_i = c.
 
-    A ValueError refuses fewer than three poses, rotations about one axis only, and a tip that did not rest.
+    A ValueError refuses fewer than three poses, rotations about only one axis, and a tip that did not rest.
 
     >>> R = [RigidTransform.from_rotation_vector(v).R for v in ((0, 0, 0), (0.4, 0, 0), (0, 0.4, 0), (-0.3, 0.2, 0))]
     >>> tip, rest = np.array([2.0, 1.0, 12.0]), np.array([5.0, 5.0, 5.0])
@@ -102,13 +102,13 @@ def tool_offsets(
     robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], *,
     opening_rad: ArrayLike | None = None, turning: ArrayLike | None = None,
 ) -> ToolOffsets:  # fmt: skip
-    """Landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + o.
+    """Estimates landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + t.
 
-    Gauss-Newton on both, started from the lifted problem that is linear in (A, A (x) p, o).  A landmark on a jaw that opens
-    has p_k = offset + sin(o_i / 2) sine + (1 - cos(o_i / 2)) versine, which is linear too, wherever its hinge lies.
+    Gauss-Newton on both, with an initial value from the relaxed problem that is linear in (A, A (x) p, t).  A landmark on a
+    jaw has p_k = offset + sin(o_i / 2) sine + (1 - cos(o_i / 2)) versine at the opening o_i; this is linear for any hinge.
 
     Args:
-        robot_from_tool: n poses, the tool turned about at least two axes.
+        robot_from_tool: n poses; the tool must be turned about at least two axes.
         u: One array a camera, (n, k, 2) px; NaN = missing.
         opening_rad: (n,) full angle between the jaws; None is a tool without a hinge.
         turning: (k,) not 0 for landmarks on a jaw; None is all but the first.
@@ -129,7 +129,7 @@ def tool_offsets(
     if half is not None:
         seen = half[frame[on_jaw[landmark]]]
         if (span := float(np.ptp(seen)) if seen.size else 0.0) < _OPENING:
-            what = f"the jaws open by {2 * span:.2g} rad only, which leaves the hinge open"
+            what = f"the jaws open by only {2 * span:.2g} rad, which does not determine the hinge"
             raise ValueError(f"opening_rad: {what}; open and close them, or leave the opening out.")
         jaw = own[:, on_jaw]
         own = np.hstack([own, np.sin(half[frame])[:, None] * jaw, (1 - np.cos(half[frame]))[:, None] * jaw])
@@ -137,7 +137,7 @@ def tool_offsets(
     if pixels.size < 4 * m + 3 * q:
         raise ValueError(f"u: {len(pixels)} detections are too few for {q} vectors of the tool and the cameras.")
     scale = t.std()
-    # The start: the problem in A, B_k = A (x) p_k and o is linear; least squares restore the rank of B_k.
+    # Initial value: the problem is linear in A, B_k = A (x) p_k and t; p_k is the least-squares solution of B_k = A (x) p_k.
     lifted = (own[:, :, None] * R.reshape(-1, 1, 9)).reshape(-1, 9 * q)
     solution = np.linalg.lstsq(np.hstack([t / scale, np.ones((len(t), 1)), lifted]), pixels, rcond=1e-6)[0]
     A, B = solution[:3].T, solution[4:].reshape(q, 3, 3, -1)  # B: vector, row of R (with A), column (with p), pixel
@@ -146,7 +146,7 @@ def tool_offsets(
         x = np.einsum("nij,nj->ni", R, own @ offset) + t
         matrix = regress(x, pixels)
         r = pixels - x @ matrix[:, :3].T - matrix[:, 3]
-        # Variable projection (Kaufman): the cameras are linear, so their columns are swept out of the offsets'.
+        # Variable projection (Kaufman): the cameras are linear, so they are eliminated from the offsets' derivatives.
         J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * q)
         Q = np.linalg.qr(np.column_stack([x - x.mean(axis=0), np.ones(len(x))]))[0]
         J -= np.tensordot(Q, np.tensordot(Q.T, J, axes=1), axes=1)
@@ -157,9 +157,9 @@ def tool_offsets(
             break
     information = flat.T @ flat
     if np.linalg.cond(information) > 1e13:
-        raise ValueError("robot_from_tool: the motion leaves an offset open by any amount; turn the tool about two axes.")
+        raise ValueError("robot_from_tool: the motion does not determine the offsets; turn the tool about two axes.")
     covariance = float((r**2).sum()) / max(r.size - 4 * m - 3 * q, 1) * np.linalg.inv(information).reshape(q, 3, q, 3)
-    # What counts is how sure a landmark is at each opening that occurs: a vector of little effect may be vague.
+    # Check the covariance of the landmarks at each opening that occurs: a vector of little effect may have a large one.
     _check_determined(np.einsum("na,aibj,nb->nij", own, covariance, own))
     blocks = covariance[np.arange(k), :, np.arange(k)]
     sine, versine = np.zeros((2, k, 3))
@@ -173,9 +173,9 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
     if len(robot_from_tool) < 3:
         raise ValueError(f"robot_from_tool: {len(robot_from_tool)} poses; three with different rotations are needed.")
     R, t = np.stack([p.R for p in robot_from_tool]), np.stack([p.t for p in robot_from_tool])
-    # A landmark is seen only through rotations that move it: two different axes at least.
+    # An offset shows only in rotations that move the landmark, so at least two axes are needed.
     if np.linalg.svd((R - R.mean(axis=0)).reshape(-1, 3), compute_uv=False)[2] < _TURN * np.sqrt(len(R)):
-        raise ValueError("robot_from_tool: the tool hardly turns, or about one axis only; rotate it about two axes.")
+        raise ValueError("robot_from_tool: the tool hardly turns, or about only one axis; rotate it about two axes.")
     return R, t
 
 
@@ -183,4 +183,4 @@ def _check_determined(covariance_mm2: np.ndarray) -> None:
     variance = np.diagonal(covariance_mm2, axis1=-2, axis2=-1)
     if not ((variance >= 0) & (variance < _LARGEST_SD_MM**2)).all():
         sd_mm = np.sqrt(np.abs(variance).max())
-        raise ValueError(f"robot_from_tool: the motion leaves an offset open by {sd_mm:.2g} mm; turn more, about two axes.")
+        raise ValueError(f"robot_from_tool: an offset has a standard deviation of {sd_mm:.2g} mm; turn more, about two axes.")

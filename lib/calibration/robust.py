@@ -1,9 +1,9 @@
-"""Which detections agree on a camera at all: the tightest consensus that the data support, each camera alone.
+"""Robust search for the detections that agree on an affine camera (the inliers), in each camera separately.
 
-Samples of four points give affine cameras, ranked with the scale of every row marginalised (a sum of log distances).  The
-best start an expectation maximisation of three populations: right detections (Gaussian), wrong ones that have something to
-do with the tool (a Gaussian at least four times as wide), and any pixel (uniform).  Few rows cannot tell three populations
-apart; there the half that agrees best takes in one row after another (the forward search).
+Random samples of four points give affine cameras, ranked by the sum of log distances (the scale of each row is marginalised).
+The best ones start an expectation maximisation of a mixture of three populations: inliers (Gaussian), outliers near the tool
+(a Gaussian at least four times as wide), and outliers anywhere (uniform).  A few rows cannot determine a mixture.  There a
+forward search starts from the half of the rows that agrees best and adds one row after another.
 """
 
 from typing import NamedTuple
@@ -15,19 +15,19 @@ from lib.calibration.affine import regress
 from lib.correspondences import DataError
 
 FALSE_ALARM = 1e-4
-_SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
-_ROWS_RANKED = 300
-_STARTS = 12  # samples that the expectation maximisation starts from
-_FEW = 25  # rows of a view, below which it goes by the forward search
-_MORE_THAN_CHANCE = 5.0  # log evidence: of clean data some rows agree better than all do by up to 4
-_LEAST_SHARE = 0.25  # of a view's rows, that must agree
-#: A wider population within this many scales of the right one is its heavy tail, else it is contamination.
+_SAMPLES = (100, 300, 1000)  # numbers of samples, tried one after another until some are free of outliers
+_ROWS_RANKED = 300  # number of rows by which samples are ranked
+_STARTS = 12  # number of samples that start the expectation maximisation
+_FEW = 25  # number of a view's rows below which the forward search is used
+_MORE_THAN_CHANCE = 5.0  # difference of log evidence: in clean data a subset agrees better than all rows by up to 4
+_LEAST_SHARE = 0.25  # smallest share of inliers in a view
+#: The wider Gaussian is the heavy tail of the inliers if it is at most this many times as wide, else it is contamination.
 _CONTRAST = 8.0
-#: Largest noise, as a share of the pixels' extent, where there are outliers that do not stand clearly apart; and without any.
+#: Largest noise as a share of the pixels' extent: with outliers that are not clearly separated, and otherwise.
 _LARGEST_NOISE = (0.01, 0.25)
-_TAILS = 0.1  # share of outliers up to which they may be the tails of the noise; more must stand apart
-_LOOSE = 3.0  # times the largest noise, up to which offsets of the landmarks may be the reason
-_NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
+_TAILS = 0.1  # share of outliers that may still be the tails of the noise; a larger share must be clearly separated
+_LOOSE = 3.0  # factor on the largest noise up to which offsets of the landmarks may be the reason
+_NEARLY_ALL = 0.8  # if a camera explains more than this share of the rows, a subset may agree better by chance
 
 
 class NoConsensusError(DataError):
@@ -35,7 +35,7 @@ class NoConsensusError(DataError):
 
 
 class LooseCameraError(NoConsensusError):
-    """Most rows agree on one camera, but loosely: landmarks that are constantly off leave as much."""
+    """Most rows agree on one camera, but loosely; constant offsets of the landmarks may be the reason."""
 
 
 class CompetingCamerasError(NoConsensusError):
@@ -43,18 +43,18 @@ class CompetingCamerasError(NoConsensusError):
 
 
 def gate(n: int, m: int) -> float:
-    """Largest squared Mahalanobis distance of a row, exceeded once in 10 000 data sets of n rows, m pixels each."""
+    """Largest squared Mahalanobis distance of an inlier, exceeded in 1 of 10 000 data sets of n rows of m coordinates."""
     return float(2.0 * gammainccinv(m / 2, FALSE_ALARM / n))
 
 
 def consensus(
     x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *, sigma_x_mm: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """The views (n, cameras) bool of x (n, 3) mm and y (n, m) px, NaN = not seen, that agree on each affine camera.
+    """Inlier views (n, cameras) bool of positions x (n, 3) mm and pixels y (n, m), NaN = not seen, and gates (cameras,).
 
-    And the squared Mahalanobis distances (cameras,) up to which a row is more probably right than wrong.  `threshold_px` is
-    the largest reprojection distance; None measures the noise and decides by it.  Samples thinner than five times the
-    robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says why a camera has none.
+    A gate is the squared Mahalanobis distance up to which a row is more probably an inlier than an outlier.  `threshold_px`
+    is the largest reprojection error of an inlier; None estimates the noise instead.  Samples thinner than five times the
+    robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says why the rows agree on no camera.
     """
     views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
     names, gates = ["u_left", "u_right"] if views.shape[1] == 2 else ["u"], []
@@ -67,7 +67,7 @@ def consensus(
 
 
 class _Found(NamedTuple):
-    """The rows (n,) bool that agree on a camera `matrix` (2, 4), their noise, the next wider population's, the gate."""
+    """The rows `keep` (n,) bool that agree on a camera `matrix` (2, 4), their noise, that of the wider Gaussian, the gate."""
 
     keep: np.ndarray
     matrix: np.ndarray
@@ -79,7 +79,7 @@ class _Found(NamedTuple):
 def _one_camera(
     name: str, x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
 ) -> _Found:
-    """What agrees on a camera of x (n, 3) and u (n, 2); a NoConsensusError if there is no one camera."""
+    """The rows of x (n, 3) and u (n, 2) that agree on a camera; a NoConsensusError if there is none, or more than one."""
     n = len(u)
     if n < 8:
         return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
@@ -95,10 +95,10 @@ def _one_camera(
         raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
-        what = f"all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in {count} of {n} rows"
+        what = f"no affine camera agrees: the best one errs by {found.sigma_px:.3g} px in {count} of {n} rows"
         loose = 2 * count > n and found.sigma_px < _LOOSE * _LARGEST_NOISE[0] * extent
         kind = LooseCameraError if loose else NoConsensusError
-        raise kind(f"{name}: no consensus, {what}, and the others do not stand apart; {cure}.")
+        raise kind(f"{name}: no consensus, {what}, and the others are not clearly separated; {cure}.")
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
     if threshold_px is not None or len(rest) < least:
         return found
@@ -113,23 +113,23 @@ def _one_camera(
     if (early < cut).mean() + (late >= cut).mean() > 1.8:
         cure = f"rows up to {cut - 1} and the later ones: the camera moved or a clock jumped, calibrate each part alone"
     else:
-        cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are taken for one another"
+        cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are mistaken for each other"
     text = f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
     raise CompetingCamerasError(text)
 
 
 def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> _Found:
-    """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
+    """Forward search for few rows: starts from the half that agrees best, adds the next best row while it passes an F test.
 
-    Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
+    Among few rows, some minimal sample always fits a few others by chance, so its residuals underestimate the noise
     (Atkinson and Riani, "Robust diagnostic regression analysis", 2000).
     """
     n, size = len(u), (len(u) + 5) // 2
     centred, H = (np.column_stack([positions, np.ones(n)]) for positions in (x - x.mean(axis=0), x))
     distance2 = _distances2(centred, u, _sampled(centred, u, 300, rng, least_mm))
-    best = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()  # of the least median
+    best = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()  # least median of squares
     keep = np.argsort(distance2[best])[:size]
-    for _ in range(10):  # concentrate: the rows nearest to their own fit
+    for _ in range(10):  # concentration steps: refit, then keep the nearest rows
         keep, before = np.argsort(((u - H @ regress(x[keep], u[keep]).T) ** 2).sum(axis=1))[:size], keep
         if set(keep) == set(before):
             break
@@ -137,7 +137,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
         r = u - H @ regress(x[keep], u[keep]).T
         freedom = 2 * (len(keep) - 4)
         variance = (r[keep] ** 2).sum() / max(freedom, 1) + (1e-11 * np.abs(u).max()) ** 2
-        # A row outside the fit is predicted with the fit's own uncertainty.
+        # The residual of a row outside the fit also contains the fit's uncertainty.
         leverage = np.einsum("ni,ij,nj->n", H, np.linalg.pinv(H[keep].T @ H[keep]), H)
         distance2 = (r**2).sum(axis=1) / variance / (1.0 + leverage)
         distance2[keep] = -1.0
@@ -152,19 +152,19 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
 
 
 def _extent(u: np.ndarray) -> np.ndarray:
-    """(2,) width and height of the pixels, whatever one row in ten does."""
+    """(2,) width and height of the area of the pixels, robust to 10 % of outliers at each end."""
     low, high = np.transpose([np.interp([0.1, 0.9], np.linspace(0, 1, len(u)), np.sort(one)) for one in u.T])
     return np.maximum((high - low) / 0.8, 1e-9)
 
 
 def _sampled(H: np.ndarray, u: np.ndarray, count: int, rng: np.random.Generator, least_mm: float) -> np.ndarray:
-    """Cameras (count, 4, 2) of H (n, 4) and u (n, 2), each through four points that span a large volume."""
+    """Cameras (up to count, 4, 2) from H = [x, 1] (n, 4) and u (n, 2), each through four points that span a large volume."""
     n, x = len(H), H[:, :3]
     sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
     volume = np.abs(np.linalg.det(x[sets[:, 1:]] - x[sets[:, :1]]))
-    sets, volume = (of_sets[np.argsort(-volume)[:count]] for of_sets in (sets, volume))  # of the largest volume
-    corners, least = x[sets] - x[sets].mean(axis=1, keepdims=True), 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
-    thick = volume / np.maximum((corners**2).sum(axis=(1, 2)), 1e-300)  # at least
+    sets, volume = (values[np.argsort(-volume)[:count]] for values in (sets, volume))  # those of the largest volume
+    corners, least = x[sets] - x[sets].mean(axis=1, keepdims=True), 1e-6 * np.abs(x).max()  # rounding errors are 1e-8
+    thick = volume / np.maximum((corners**2).sum(axis=(1, 2)), 1e-300)  # a lower bound
     thin = thick <= max(least, least_mm)
     thick[thin] = np.sqrt(np.maximum(np.linalg.eigvalsh(corners[thin].mT @ corners[thin])[:, 0], 0.0))
     if not (spans := thick > least).any():
@@ -183,19 +183,19 @@ def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
 
 
 def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
-    """Rank (k,) of cameras by squared distances (k, n): the least sum of logs, so that no noise level is assumed."""
+    """Scores (k,) of cameras from squared distances (k, n), low = good: a sum of logs, which assumes no noise level."""
     return np.log(np.minimum(distance2, area / np.pi) + 1e-7 * area).sum(axis=1)
 
 
 def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The camera (2, 4) through four of the points x (n, 3) mm that most pixels u (n, 2) are near to."""
+    """The camera (2, 4) through four of the points x (n, 3) mm that is nearest to most of the pixels u (n, 2)."""
     H = np.column_stack([x, np.ones(len(x))])
     M = _sampled(H, u, 150, rng, 0.0)
     return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
 
 
 def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float) -> _Found:
-    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
+    """The inliers of the camera of maximum evidence, or with `threshold_px` of the one with the least MSAC score."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
     area = float(np.prod(_extent(u)))
@@ -211,7 +211,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
         M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))
         best = np.argsort(score)[:_STARTS]
         M, score, near2 = M[best], score[best], near2[best]
-        # Where half the rows and more agree with the best sample, right samples are many.
+        # If more than half of the rows agree with the best sample, enough samples are free of outliers.
         if threshold_px is None and (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
             break
     if threshold_px is not None:
@@ -223,13 +223,13 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
         return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
     scales = np.sqrt(np.append(near2 / 8, np.median(_distances2(H[some], u[some], M[:4]), axis=1)))
     M, scales, share, evidence = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), scales, area, 8)
-    # The best of each noise level, and the one with most rows: the others arrive where these do.
+    # Continue with the best of each noise level and with the one of most rows; the others would converge to the same.
     order = np.argsort(-evidence)
     level = np.round(3.0 * np.log(scales[order, 0]))
     few = order[np.sort(np.unique(level, return_index=True)[1])][:5]
     few = np.unique([*few, share[:, 0].argmax()])
     M, scales, share, evidence = _mixture(H[some], u[some], M[few], scales[few, 0], area, 50)
-    # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
+    # If a camera explains nearly all rows, one that explains fewer must have a clearly higher evidence.
     best, most = evidence.argmax(), share[:, 0].argmax()
     chance = evidence[best] < evidence[most] + _MORE_THAN_CHANCE or share[best, 0] < _LEAST_SHARE
     best = most if share[most, 0] > _NEARLY_ALL and chance else best
@@ -239,7 +239,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     sigma, wider = scales[best].tolist()
     share = share[best]
     gate2 = gate(n, 2)
-    if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
+    if wider > _CONTRAST * sigma:  # contamination: keep a row if it is more probably an inlier than an outlier
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
     keep = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2
@@ -253,8 +253,8 @@ def _mixture(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Expectation maximisation of the three populations from k cameras M (k, 4, 2) and noise levels `sigma` (k,).
 
-    The cameras, scales (k, 2) and shares (k, 3) of the populations, and log evidence (k,): the likelihood with the cameras
-    integrated out, of which a camera that a few rows fix to a hair by chance has little.
+    Returns the cameras, scales (k, 2) and shares (k, 3) of the populations, and the log evidence (k,): the likelihood with
+    the cameras integrated out.  The evidence is low for a camera that fits a few rows closely by chance.
     """
     n, k, side = len(u), len(M), np.sqrt(area)
     products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
@@ -265,7 +265,7 @@ def _mixture(
     for i in range(rounds):
         scale = 1.0 / variance
         at_peak = share[:2] * scale * (area / (2.0 * np.pi * share[2]))
-        # Odds against any pixel; the exponential is slow below.
+        # Odds relative to the uniform population; the exponential is slow below -500.
         p = at_peak[:, :, None] * np.exp(np.maximum((-0.5 * scale)[:, :, None] * distance2, -500.0))
         total = 1.0 + p[0] + p[1]
         likelihood = np.log(total).sum(axis=1) + n * np.log(share[2] / area)
@@ -279,9 +279,9 @@ def _mixture(
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
         distance2 = _distances2(H, u, M)
         mass, squares = p.sum(axis=2), np.einsum("ckn,kn->ck", p, distance2)
-        # The camera's eight numbers are paid for by the pixels that weigh in it.
-        paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[0] / variance[1])
-        first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
+        # The camera's eight parameters cost degrees of freedom of both populations, in proportion to their weights.
+        lost = 8.0 * mass[0] / (mass[0] + mass[1] * variance[0] / variance[1])
+        first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - lost, 1.0), floor**2)
         second = np.maximum(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first)
         variance = np.array([first, np.minimum(second, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)])
         share = np.array([*(mass + 1.0), n + 1.0 - mass[0] - mass[1]]) / (n + 3)

@@ -16,29 +16,29 @@ from lib.correspondences import Correspondences, DataError
 from lib.geometry import precision
 from lib.recordings import Kinematics
 
-_GRID = 41  # trial offsets of the coarse search
-_SMOOTH_S = 0.1  # within which the robot's motion is smooth
-#: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
-#: misfit must be, and the largest residual, as a share of the pixels' extent.
+_GRID = 41  # number of trial offsets in the coarse search
+_SMOOTH_S = 0.1  # the robot's motion is smooth within this time
+#: A minimum of the misfit is clear if it is this far below the median trial in each camera; then landmarks may have constant
+#: offsets.  The second number is the largest residual with such offsets, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS there and at `trial_s`."""
+    """t_robot = t_video + offset_s, its standard deviation (with correlated errors), and the RMS there and at `trial_s`."""
 
     offset_s: float
     sd_s: float
-    rms_px: float  # of the detections that agree
+    rms_px: float  # over the inliers
     trial_s: np.ndarray
     trial_rms_px: np.ndarray
 
 
 class Paths:
-    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, a piece a stretch without a gap.
+    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, one for each stretch without a gap.
 
-    The derivative of an interpolating spline is mostly encoder noise at 100 Hz, which biases what is regressed on it.
-    Of each landmark `samples` has the times (m,) s, and the positions (m, 3) mm, NaN where the robot is silent.
+    At 100 Hz the derivative of an interpolating spline is mostly encoder noise, which would bias a regression on it.
+    `samples` has for each landmark the times (m,) s, and the positions (m, 3) mm, NaN where the robot reports none.
 
     >>> time = np.linspace(0, 1, 101)
     >>> paths = Paths([(time, np.outer(time, [1.0, 2.0, 3.0]))])
@@ -47,14 +47,14 @@ class Paths:
     """
 
     def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
-        self.pieces: list[list[BSpline]] = []  # of each landmark
+        self.pieces: list[list[BSpline]] = []  # for each landmark
         for time, x in samples:
             self.pieces.append([])
             known = np.isfinite(x).all(axis=1)
             time, x = time[known], x[known]
             step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
             every = max(2, int(np.ceil(_SMOOTH_S / step)))
-            # The motion is smooth within that time, so a dropped sample is bridged; a longer silence is not.
+            # The motion is smooth within 0.1 s, so a dropped sample is bridged; a longer gap is not.
             gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
             for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
                 if len(t) >= 4:
@@ -63,12 +63,12 @@ class Paths:
 
     @property
     def span_s(self) -> float:
-        """From the first to the last instant known."""
+        """Time from the first to the last instant of the paths."""
         ends = np.array([[piece.t[0], piece.t[-1]] for pieces in self.pieces for piece in pieces])
         return float(np.ptp(ends)) if len(ends) else 0.0
 
     def at(self, landmark: np.ndarray, time: np.ndarray, derivative: int = 0, within_s: float = 0.0) -> np.ndarray:
-        """(..., n, 3) mm or mm/s of landmarks (n,) at times (..., n); NaN where no piece covers `within_s` around them."""
+        """(..., n, 3) mm or mm/s of landmarks (n,) at times (..., n); NaN where no spline covers the time +- `within_s`."""
         x = np.full((*time.shape, 3), np.nan)
         for k, pieces in enumerate(self.pieces):
             for piece in pieces:
@@ -81,15 +81,15 @@ def estimate_time_offset(
     data: Correspondences | tuple[ArrayLike, list[ArrayLike]], kinematics: Kinematics | tuple[ArrayLike, ArrayLike], *,
     start_s: float = 0.0, search_s: float = 0.2,
 ) -> TimeOffset:  # fmt: skip
-    """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
+    """Offset of the clocks: the time shift of the kinematics with which affine cameras explain the video best.
 
-    A coarse search by Cauchy's misfit, then Gauss-Newton over the detections that agree on cameras there: with v the
-    velocity, y = A x(t) + o + (A v) offset is linear in the offset.
+    A coarse search minimises a Cauchy misfit.  Then Gauss-Newton on the inliers: with the velocity v,
+    y = A x(t) + o + (A v) offset is linear in the offset.
 
     Args:
         data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
-        kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is
-            fast; their noise is averaged over 0.1 s.  NaN where the robot is silent: rows in a longer gap are left out.
+        kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), sampled densely enough for
+            the motion; their noise is averaged over 0.1 s.  NaN = no report; rows in longer gaps are dropped.
         start_s, search_s: Middle and half width of the search.
 
     A `DataError` refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
@@ -112,18 +112,18 @@ def estimate_time_offset(
         return paths.at(landmark, time + offset, derivative)
 
     def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Each pixel's motion with the offset (n, m), the weights (n, m, m) and residuals (n, m); zero in views not used."""
+        """Derivative of the pixels by the offset (n, m), weights (n, m, m), residuals (n, m); zero in views not used."""
         x, v = at(offset), at(offset, 1)
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
         A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
         sigma_u, sigma_x = estimate_noise(r[views.any(axis=1)], A, 4 * m, views[views.any(axis=1)])
         W = np.broadcast_to(precision((sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T)[None], views), (len(x), m, m))
-        # Sweep [x, 1] out of the velocity's image: the cameras are fitted along with the offset.
-        image = np.zeros_like(y)
+        # The cameras are fitted together with the offset, so remove the part of v that is linear in [x, 1].
+        derivative = np.zeros_like(y)
         for c, rows in enumerate(views.T):
-            swept = v[rows] - np.column_stack([x[rows], np.ones(rows.sum())]) @ regress(x[rows], v[rows]).T
-            image[rows, 2 * c : 2 * c + 2] = swept @ A[2 * c : 2 * c + 2].T
-        return image, W, r
+            rest = v[rows] - np.column_stack([x[rows], np.ones(rows.sum())]) @ regress(x[rows], v[rows]).T
+            derivative[rows, 2 * c : 2 * c + 2] = rest @ A[2 * c : 2 * c + 2].T
+        return derivative, W, r
 
     low, high, far_px = start_s - search_s, start_s + search_s, _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
     trial = np.linspace(low, high, _GRID)
@@ -142,14 +142,14 @@ def estimate_time_offset(
                 break
             views = consensus(at(offset), y, far_px, np.random.default_rng(0))[0]
         used = np.repeat(views, 2, axis=1)
-        misfit = _rms_px(x_mm, y, views)  # of right detections squares tell more than absolute values
+        misfit = _rms_px(x_mm, y, views)  # without outliers, squares are more precise than absolute values
         offset = float(trial[misfit.argmin()])
         for _ in range(20):
-            image, W, r = linearised(offset)
-            information = np.einsum("ni,nij,nj->", image, W, image)
+            derivative, W, r = linearised(offset)
+            information = np.einsum("ni,nij,nj->", derivative, W, derivative)
             if information <= 0:
-                raise DataError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
-            step = np.einsum("ni,nij,nj->", image, W, r) / information
+                raise DataError("kinematics: the tool's velocity does not vary, so the offset cannot be estimated.")
+            step = np.einsum("ni,nij,nj->", derivative, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:
                 break
@@ -157,16 +157,16 @@ def estimate_time_offset(
         raise DataError(f"search_s: the search ends at its {'lower' if offset == low else 'upper'} edge; widen search_s.")
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
-        raise DataError(f"search_s: the search leaves {rms_px:.0f} px RMS at its best; widen search_s.")
-    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
+        raise DataError(f"search_s: the best offset has an error of {rms_px:.0f} px RMS; widen search_s.")
+    sd = float(np.sqrt(sandwich(derivative[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, rms_px, trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:
-    """What the robot's clock is still off by where `data` were paired with `offset_s`, s, and its standard deviation.
+    """The remaining error, s, of the clock offset `offset_s` with which `data` were paired, and its standard deviation.
 
-    A `further_step` from the calibration `found` of `data`; 0 and infinity where the kinematics are too sparse for it.
-    `estimate_time_offset` knows no offsets; those of a turning tool look like a part of the time.
+    A `further_step` from the calibration `found` of `data`; 0 and infinity if the kinematics are too sparse for it.
+    Unlike `estimate_time_offset` it allows for landmark offsets; in a turning tool these look like a clock offset.
     """
     rows = data.subset(found.inliers)
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
@@ -176,7 +176,7 @@ def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematic
 
 
 def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """RMS (t,) of the views (n, cameras) of pixels y (n, m) about the least-squares cameras of positions x (t, n, 3)."""
+    """RMS residuals (t,) of pixels y (n, m) in `views` (n, cameras), for least-squares cameras of positions x (t, n, 3)."""
     squares = np.zeros(len(x))
     for c, rows in enumerate(views.T):
         own, u = (v - v.mean(axis=-2, keepdims=True) for v in (x[:, rows], y[rows, 2 * c : 2 * c + 2]))
@@ -186,10 +186,10 @@ def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
 
 
 def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Misfit (t, cameras) of pixels y (n, m), NaN = not seen, to the cameras that suit each trial's positions x (t, n, 3).
+    """Misfit (t, cameras) of pixels y (n, m), NaN = not seen, to the cameras fitted to each trial's positions x (t, n, 3).
 
-    The mean negative log of a bivariate Cauchy density whose scale is the median residual: right detections decide, however
-    many others there are.  Infinite where fewer than 60 % of the rows, or than eight, have a position.
+    It is the mean negative log of a bivariate Cauchy density whose scale is the median residual, which is robust to outliers.
+    It is infinite where fewer than eight rows, or fewer than 60 % of them, have a position.
     """
     found = np.full((len(x), y.shape[1] // 2), np.inf)
     for c, u in enumerate(np.split(y, found.shape[1], axis=1)):
@@ -197,14 +197,14 @@ def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         used = np.isfinite(x[:, seen]).all(axis=2)
         good = used.sum(axis=1) >= max(8, 0.6 * seen.sum())
         used, own = used[good], x[good][:, seen]
-        own = own - own[used].sum(axis=0) / max(used.sum(), 1)  # far from the origin the normal equations would lose digits
+        own = own - own[used].sum(axis=0) / max(used.sum(), 1)  # centred, else the normal equations lose digits
         H = np.where(used[:, :, None], np.concatenate([own, np.ones((*used.shape, 1))], axis=2), 0.0)
         u, weight = u[seen], used.astype(float)
-        middle = (used.sum(axis=1, keepdims=True) - [1, 0]) // 2  # of the used ones; nanmedian takes ten times as long
+        middle = (used.sum(axis=1, keepdims=True) - [1, 0]) // 2  # ranks of the median; nanmedian takes ten times as long
         for _ in range(10):
             WH = (H * weight[:, :, None]).transpose(0, 2, 1)
             G = WH @ H
-            G += 1e-14 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)  # of a tool at rest it is singular
+            G += 1e-14 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)  # for a tool at rest it would be singular
             r = u - H @ np.linalg.solve(G, WH @ u)
             r2 = r[..., 0] ** 2 + r[..., 1] ** 2  # a sum over an axis of two takes ten times as long
             ranked = np.take_along_axis(np.sort(np.where(used, r2, np.inf), axis=1), middle, axis=1)
@@ -215,7 +215,7 @@ def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Times (n,), frames (n,), landmarks (n,) and pixels (n, m), NaN = not seen, a row a landmark."""
+    """Times (n,), frames (n,), landmarks (n,) and pixels (n, m), NaN = not seen; one row for each landmark of a frame."""
     if isinstance(data, Correspondences):
         return data.time_s, data.frame, data.landmark, data.stacked_px
     time, u = np.asarray(data[0], dtype=np.float64), [np.asarray(pixels, dtype=np.float64) for pixels in data[1]]

@@ -125,8 +125,8 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
         what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
-        cure = "Or give a number: t_robot = t_video + offset_s"
-        raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}.") from None
+        cure = f"Or give a number: t_robot = t_video + offset_s. {draft.mistimed}".rstrip()
+        raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
     with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))
         calibration = calibrate_as_shown(data, image_size_px=draft.image_size_px)

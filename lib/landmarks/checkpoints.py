@@ -14,7 +14,7 @@ _CURE = "get the file again, or train one with `python3 -m lib train`."
 
 
 def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
-    """SHA-256 (hexadecimal) over names, types, shapes and bytes of the tensors and over the metadata but ``"sha256"``."""
+    """SHA-256 (hexadecimal) of the tensors' names, types, shapes and bytes, and of the metadata except ``"sha256"``."""
     parts = []
     for name, tensor in sorted(tensors.items()):
         parts.append(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
@@ -24,7 +24,7 @@ def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
 
 
 def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, object]) -> None:
-    """Write tensors, JSON metadata and their checksum as a safetensors file; an error leaves the old file as it was.
+    """Write tensors, JSON metadata and their checksum as a safetensors file; if that fails, the old file is unchanged.
 
     >>> import tempfile, torch
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -44,7 +44,7 @@ def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dic
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
 
-    A FileNotFoundError if there is none; a ValueError if it is damaged, has no checksum, or holds something else.
+    Raises FileNotFoundError if there is no file, and ValueError if it is damaged, has no checksum or another format.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such weights file; train one with `python3 -m lib train`.")
@@ -54,7 +54,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         metadata = {name: json.loads(value) for name, value in texts.items()}
     except (SafetensorError, ValueError, OSError) as error:
-        raise ValueError(f"{path}: corrupt, or no weights file of this program ({error}); {_CURE}") from error
+        raise ValueError(f"{path}: corrupt, or not a weights file of this program ({error}); {_CURE}") from error
     if metadata.get("format") != kind:
         raise ValueError(f"{path}: holds {metadata.get('format', 'foreign weights')!r}, expected {kind!r}; {_CURE}")
     if metadata.pop("sha256", None) != checksum(tensors, texts):
@@ -63,7 +63,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
 
 
 def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = "") -> Network:
-    """A network from its configuration and those tensors of a file whose names begin with `prefix`; errors name the file."""
+    """Make the network of a configuration, with the tensors whose names begin with `prefix`; error messages name `path`."""
     try:
         network = network_of((OffsetConfig if "size_px" in config else HourglassConfig)(**config))
         own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -1,19 +1,19 @@
-"""Images with more contrast, which a detector in doubt sees, too: a dull tool or an odd light often becomes clear there."""
+"""Contrast enhancement.  If the detector is unsure, it looks again with more contrast, where a dull tool is easier to see."""
 
 import cv2
 import numpy as np
 
-#: Equalising acts on so many tiles along each side, and enlarges contrast by about so much at most.
+#: `equalised`: number of tiles along each side, and the approximate limit of the contrast gain (CLAHE's clip limit).
 _TILES, _LIMIT = 8, 2.0
-#: Levelling smooths by this share of the longer side, since differences are noisy, and enlarges them until this percentile of
-#: them has this size, within limits; chosen on validation recordings.
-_SMOOTH, _DIFFERENT, _DIFFERENCE, _GAINS = 1e-3, 99.5, 80.0, (1.0, 4.0)
-#: Stretching makes these percentiles black and white; it estimates them on every fourth row and column.
-_PERCENTILES, _EVERY = (1.0, 99.0), 4
+#: `levelled`: sigma of the smoothing against noise, as a share of the longer side.  The gain brings this percentile of the
+#: absolute differences to this value (of 255), within the given range.  Chosen on validation recordings.
+_SMOOTHING, _DIFFERENCE_PERCENTILE, _TARGET_DIFFERENCE, _GAIN_RANGE = 1e-3, 99.5, 80.0, (1.0, 4.0)
+#: `stretched`: the percentiles that become black and white.  Percentiles are estimated on every `_STEP`-th row and column.
+_STRETCH_PERCENTILES, _STEP = (1.0, 99.0), 4
 
 
 def equalised(image: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) uint8 RGB whose lightness is equalised tile by tile (CLAHE; Zuiderveld 1994).
+    """Equalise the lightness of an image (h, w, 3) uint8 RGB tile by tile (CLAHE; Zuiderveld 1994).
 
     >>> dull = np.random.default_rng(0).integers(90, 99, (64, 64, 1), np.uint8).repeat(3, axis=2)
     >>> bool(equalised(dull).std() > 1.5 * dull.std())
@@ -25,20 +25,20 @@ def equalised(image: np.ndarray) -> np.ndarray:
 
 
 def stretched(image: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) uint8 RGB each of whose channels is stretched to all of its range.
+    """Stretch each channel of an image (h, w, 3) uint8 RGB to the full range 0 to 255.
 
     >>> stretched(np.full((8, 8, 3), 90, np.uint8) + np.arange(8, dtype=np.uint8)[:, None]).max()
     np.uint8(255)
     """
-    low, high = np.percentile(image[::_EVERY, ::_EVERY], _PERCENTILES, axis=(0, 1))
+    low, high = np.percentile(image[::_STEP, ::_STEP], _STRETCH_PERCENTILES, axis=(0, 1))
     values = (np.arange(256)[:, None] - low) * (255 / np.maximum(high - low, 1.0))
     return cv2.LUT(image, np.clip(np.round(values), 0, 255).astype(np.uint8).reshape(256, 1, 3))
 
 
 def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) uint8 RGB on a ground of one colour: what differs from its ground, seen in its light, enlarged.
+    """Replace the ground of an image (h, w, 3) uint8 RGB by its mean colour and amplify what differs from the ground.
 
-    A ValueError if the ground is not of the image's size.
+    `ground` is an image without the tool; it is scaled to the light of `image`.  Raises ValueError if its size differs.
 
     >>> ground = np.random.default_rng(0).integers(0, 200, (64, 64, 3), np.uint8)
     >>> tool = np.zeros((64, 64, 1), np.uint8)
@@ -48,11 +48,11 @@ def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
     np.int64(80)
     """
     if image.shape != ground.shape:
-        raise ValueError(f"ground: expected {image.shape}, as the image, got {ground.shape}.")
-    some = (part[::_EVERY, ::_EVERY] + 1.0 for part in (image, ground))
-    ground = cv2.multiply(ground, (*np.median(np.divide(*some), axis=(0, 1)), 0.0))
-    difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTH * max(image.shape))
-    size = np.percentile(np.abs(difference[::_EVERY, ::_EVERY]).max(axis=2), _DIFFERENT)
-    gain = float(np.clip(_DIFFERENCE / max(size, 1.0), *_GAINS))
+        raise ValueError(f"ground: expected {image.shape}, the same as the image, got {ground.shape}.")
+    thinned = (part[::_STEP, ::_STEP] + 1.0 for part in (image, ground))
+    ground = cv2.multiply(ground, (*np.median(np.divide(*thinned), axis=(0, 1)), 0.0))
+    difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTHING * max(image.shape))
+    largest = np.percentile(np.abs(difference[::_STEP, ::_STEP]).max(axis=2), _DIFFERENCE_PERCENTILE)
+    gain = float(np.clip(_TARGET_DIFFERENCE / max(largest, 1.0), *_GAIN_RANGE))
     # OpenCV clips at 0 and 255.
     return cv2.addWeighted(difference, gain, np.full_like(difference, ground.mean(axis=(0, 1))), 1.0, 0.0, dtype=cv2.CV_8U)

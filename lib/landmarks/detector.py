@@ -1,10 +1,10 @@
 """The detector: images in, landmarks with covariance and confidence out.
 
-It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
-its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
-look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
-last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast, then swept by the
-second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second stage
+locates the landmarks in one upright window, scaled so that every tool has the same length in it.  It looks twice, since the
+first look corrects the window's direction and scale.  If the window does not show the tool well, this stage chooses between
+several candidates.  The last stage measures each landmark in a closeup.  If the result is unsure, the detector looks again
+with more contrast, then sweeps the image.  The paper's detector (Sec. III) is the first stage alone, at full resolution.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,31 +35,31 @@ from lib.landmarks.search import PEAKS, best_tools, likelihood, several_peaks
 from lib.parallel import single_threaded_torch
 
 FORMAT = "microstereo.detector"
-#: The stages that have networks of their own, in the order of their use.
+#: The stages that have their own networks, in the order of their use.
 _STAGES = ("frame", "tool", "closeup")
-#: The fields that a weights file keeps as plain values.
+#: The fields that a weights file stores as plain values.
 _SETTINGS = ("frame_px", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
-#: Below this confidence a landmark is not followed from frame to frame.
+#: A landmark with a lower confidence is not followed from frame to frame.
 TRACKED_FROM = 0.5
-#: Below this mean confidence of its landmarks an image is seen again; chosen on validation images.
+#: If the mean confidence of its landmarks is lower, the detector looks at an image again; chosen on validation images.
 _UNSURE = 0.5
-#: The stages that look at closeups: of what the tool's window showed, of what that moved far, and of the frame before.
+#: The stages that use closeups: the first closeup, a second one if the first moved the landmark far, and tracking.
 CLOSE = ("closeup", "closer", "tracking")
-#: Where a window's peaks are lower than this (mean), the first stage's peaks at these scales make candidates.
-_SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
-_SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
-#: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
-_CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
-#: A sweep looks for tools of these lengths, shares of the image's longer side, in so many turns; chosen on validation images.
-_SWEPT, _TURNS = (0.21, 0.1), 6
-_UNWITNESSED = 0.5  # what a sweep finds has this times its confidence, since the first stage did not see it there
-#: Share of the tool's length: as near to where it is expected a landmark is taken for it, farther off for another thing.
+#: If the mean height of a window's peaks is lower than this, the first stage's peaks at these scales give candidates.
+_GOOD_HEIGHT, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
+_SURE = 0.5  # after a search, or if a confidence of the first stage is lower, confidences become this times the peaks' height
+#: Number of candidates for a first look, number of those for a second, and the peak height below which there is no candidate.
+_CANDIDATES, _SECOND_LOOKS, _NO_PEAK = 24, 6, 0.01
+#: A sweep looks for tools of these lengths (shares of the longer side) at this many angles; chosen on validation images.
+_SWEEP_LENGTHS, _SWEEP_ANGLES = (0.21, 0.1), 6
+_SWEEP_FACTOR = 0.5  # on the confidence of a sweep's result, since the first stage did not confirm it
+#: Share of the tool's length.  A detection farther than this from the expected position is taken for another object.
 NEAR = 0.1
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
-#: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
+#: The second look at the tool averages the heatmaps of the window and of its mirror image: they are low if the two disagree.
 MIRRORED = "again"
 
 
@@ -70,7 +70,7 @@ class Landmarks:
     Attributes:
         u: (n, 3, 2) px, NaN where missing.
         covariance: (n, 3, 2, 2) px^2, NaN where missing.
-        confidence: (n, 3), probability that the landmark is in view, within 5 % of the tool's length of `u`; 0 where missing.
+        confidence: (n, 3), probability that the landmark is in view within 5 % of the tool's length of `u`; 0 where missing.
 
         >>> found = Landmarks.none(2)
         >>> len(found), len(found[:1]), found.u.shape
@@ -89,52 +89,52 @@ class Landmarks:
 
     @classmethod
     def none(cls, n: int) -> Self:
-        """Nothing found in n images."""
+        """The result for n images in which nothing was found."""
         return cls(np.full((n, 3, 2), np.nan), np.full((n, 3, 2, 2), np.nan), np.zeros((n, 3)))
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
-        """The landmarks of several sets of images, one after the other."""
+        """Concatenate the landmarks of several sets of images."""
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("u", "covariance", "confidence")))
 
     def without_unsure(self) -> Self:
-        """NaN and confidence 0 for every landmark below `MISSING_BELOW`."""
+        """A copy in which every landmark below `MISSING_BELOW` is NaN with confidence 0."""
         missing, result = ~(self.confidence >= MISSING_BELOW), Landmarks.join([self])  # a copy
         result.u[missing], result.covariance[missing], result.confidence[missing] = np.nan, np.nan, 0.0
         return result
 
     @property
     def doubtful(self) -> np.ndarray:
-        """(n,) bool, images that leave doubt: the mean confidence of their landmarks is low."""
+        """(n,) bool: images whose landmarks have a low mean confidence."""
         return self.confidence.mean(1) < _UNSURE
 
     def surest(self, other: Self) -> Self:
-        """Of each image these landmarks or the `other` ones: those whose mean confidence is higher."""
+        """Choose for each image these landmarks or the `other` ones, whichever have the higher mean confidence."""
         result, better = Landmarks.join([self]), other.confidence.mean(1) > self.confidence.mean(1)
         result.put(better, other[better])
         return result
 
     def away(self, u: np.ndarray) -> np.ndarray:
-        """(n, 3) bool: landmarks farther than `NEAR` from u (n, 3, 2) px, where they are expected."""
+        """(n, 3) bool: landmarks farther than `NEAR` from the expected positions u (n, 3, 2) px."""
         return np.linalg.norm(self.u - u, axis=2) > NEAR * tool_length_px(u)[:, None]
 
     def put(self, rows: np.ndarray, values: Self) -> None:
-        """Replace those of some images."""
+        """Replace the landmarks of the images `rows`, in place."""
         self.u[rows], self.covariance[rows], self.confidence[rows] = values.u, values.covariance, values.confidence
 
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """Finds the landmarks in frames of any size and number; one detector serves both cameras.
+    """Finds the landmarks in any number of frames of any size; one detector serves both cameras.
 
     Attributes:
-        frame_network, frame_px: The first stage, which sees the frame with a longer side of `frame_px`; None = as it is.
-        tool_network: The second stage, which sees one window round the tool; None = no such stage.
-        closeup_network: The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
+        frame_network, frame_px: The first stage, and the longer side to which it shrinks the frame; None = full resolution.
+        tool_network: The second stage, which looks at one window around the tool; None = no such stage.
+        closeup_network: The last stage, which predicts the landmark's position in a closeup; None = no such stage.
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"closeup"``
-            and ``"closer"`` for two closeups, the second where the first moved the landmark far, and ``"tracking"`` for the
+            and ``"closer"`` for two closeups, the second if the first moved the landmark far, and ``"tracking"`` for the
             closeups that follow a landmark from frame to frame.
-        engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
+        engine: Runs the networks; one of `lib.landmarks.engines.ENGINES`.  The weights do not depend on it.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
         >>> found.u.shape, bool((found.confidence < 0.5).all())
@@ -154,13 +154,13 @@ class Detector:
     def __post_init__(self) -> None:
         check(self, "frame_px", lambda v: v is None or v >= 16, "must be at least 16 px")
         if self.closeup_network and not self.tool_network:
-            raise ValueError("closeup_network: looks at what a tool_network has found; give one.")
+            raise ValueError("closeup_network: needs the landmarks of a tool_network; give one.")
         run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
             self._run[stage] = run(self.network_of(stage), self.engine, mirror=stage == MIRRORED)
 
     def network_of(self, stage: str) -> Network:
-        """The network of a stage, which may be another stage's."""
+        """The network of a stage, which several stages may share."""
         return self.networks[_NETWORK_OF.get(stage, stage)]
 
     @property
@@ -176,10 +176,10 @@ class Detector:
 
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
-        """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.
+        """Load a detector from a weights file, or by its name in ``data/models``; None = the one that ships.
 
-        `engine` runs its networks; None is the fastest one here (`lib.landmarks.engines.default_engine`).
-        A FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or no detector.
+        `engine` runs its networks; None = the fastest one here (`lib.landmarks.engines.default_engine`).
+        Raises FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or not a detector.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():
@@ -188,7 +188,7 @@ class Detector:
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
         if other := metadata["networks"].keys() - set(_STAGES):
-            raise ValueError(f"{path}: it has networks of stages that are none ({', '.join(sorted(other))}); train it anew.")
+            raise ValueError(f"{path}: it has networks of unknown stages ({', '.join(sorted(other))}); train it anew.")
         configs = metadata["networks"].items()
         networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
         try:
@@ -203,9 +203,9 @@ class Detector:
         return detector
 
     def save(self, path: str | Path) -> None:
-        """Write the detector as one safetensors file; a `ValueError` if a stage has no error model.
+        """Write the detector as one safetensors file.  Raises ValueError if a stage has no error model.
 
-        Weights that half precision holds exactly (`Network.halved`) take half the place.
+        Weights that half precision represents exactly (`Network.halved`) take half the space.
         """
         self._check_complete(path)
         tensors, metadata = self._content()
@@ -215,12 +215,12 @@ class Detector:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that decides what it finds: weights, settings, error models and engine."""
+        """SHA-256 of everything that determines the results: weights, settings, error models and engine."""
         tensors, metadata = self._content()
         return checksum(tensors, metadata | {"engine": self.engine})
 
     def _content(self) -> tuple[dict[str, Tensor], dict[str, object]]:
-        """Tensors and metadata of the detector's file."""
+        """Tensors and metadata for the detector's file."""
         states = {stage: network.state_dict() for stage, network in self.networks.items()}
         tensors = {f"{stage}.{key}": value for stage, state in states.items() for key, value in state.items()}
         return tensors, {name: getattr(self, name) for name in _SETTINGS} | {
@@ -237,11 +237,11 @@ class Detector:
             raise ValueError(f"{path}: {what}; {cure}.")
 
     def __call__(self, images: ArrayLike, *, batch: int = 4, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
-        """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
+        """Detect the landmarks in images (n, h, w, 3), uint8 RGB or float in [0, 1], `batch` images at a time.
 
-        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `ground` gives the
-        images (n, h, w, 3) uint8 without the tool, such as `Recording.ground`: where there is doubt, what differs from them
-        is looked at first.  A `ValueError` for another shape, type or range.
+        If the result is unsure, the detector looks again with more contrast, then sweeps the image, which takes many times
+        as long.  `ground` returns the images (n, h, w, 3) uint8 without the tool, as `Recording.ground` does; an unsure
+        detector then first looks at the difference from them.  Raises ValueError for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -249,7 +249,7 @@ class Detector:
             return Landmarks.join([self._seen(images[p], ground and (lambda p=p: ground()[p])) for p in parts])
 
     def _seen(self, images: np.ndarray, ground: Callable[[], np.ndarray] | None) -> Landmarks:
-        """Landmarks of a few images.  One in doubt is seen again with more contrast, then swept; its surest look counts."""
+        """Detect in a few images.  If unsure, look again with more contrast, then sweep; the surest result counts."""
         result = self._once(images)
         looks = [lambda i: equalised(images[i]), lambda i: stretched(images[i]), lambda i: images[i]]
         if ground is not None:
@@ -257,30 +257,30 @@ class Detector:
         for k, look in enumerate(looks if self.tool_network else (), 1):
             if len(unsure := np.flatnonzero(result.doubtful)):
                 other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
-                other = other if k < len(looks) else replace(other, confidence=_UNWITNESSED * other.confidence)
+                other = other if k < len(looks) else replace(other, confidence=_SWEEP_FACTOR * other.confidence)
                 result.put(unsure, result[unsure].surest(other))
         return result
 
     def _once(self, images: np.ndarray, sweep: bool = False) -> Landmarks:
-        """Landmarks of a few images as they are, by all stages but tracking; `sweep` as in `searched`."""
+        """Detect in a few images as given, by all stages but tracking; `sweep` as in `searched`."""
         rough = self.coarse(images)
-        seen = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
-        result = self.searched(images, rough, seen, sweep=sweep)
+        known = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
+        result = self.searched(images, rough, known, sweep=sweep)
         same = np.array_equal(result.u, rough.u, equal_nan=True)
         before = rough
         for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
-            again = view.moved_far(before.u, result.u) if stage == "closer" else None
+            far = view.moved_far(before.u, result.u) if stage == "closer" else None
             before = result
-            result = self.refine(images, result, stage, seen if same and stage == "tool" else None, only=again)
+            result = self.refine(images, result, stage, known if same and stage == "tool" else None, only=far)
         return result
 
     def track(
         self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM,
         ground: Callable[[], np.ndarray] | None = None,
     ) -> Landmarks:  # fmt: skip
-        """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
+        """Follow the landmarks `previous` into the images (n, h, w, 3), such as the next left and right image.
 
-        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole, on its `ground`.
+        Only closeups are used.  An image with a landmark below `min_confidence` is searched as in a call, with `ground`.
         """
         images = as_uint8(images)
         if len(previous) != len(images):
@@ -299,15 +299,15 @@ class Detector:
         return result.without_unsure()
 
     def near(self, images: np.ndarray, u: np.ndarray, *, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
-        """What the later stages see in images (n, h, w, 3) where landmarks u (n, 3, 2) px are expected, NaN = nowhere.
+        """Detect by the later stages alone, in images (n, h, w, 3) at expected positions u (n, 3, 2) px; NaN = unknown.
 
-        A landmark farther off than `NEAR` is another thing, and missing.  `ground` as in a call.
+        A detection farther than `NEAR` from the expected position counts as missing.  `ground` as in a call.
         """
         known = np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
         u = np.where(known[..., None], u, np.nan)
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))
-        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
+        # A window shows the whole tool.  With closeups alone, their constant error would add up if the caller repeats this.
         stages = [stage for stage in self.stages if stage in ("again", "closeup", "closer")]
         stages = stages if "again" in stages else ["tracking", "tracking"]
         for stage in stages:
@@ -319,31 +319,31 @@ class Detector:
         return found.without_unsure()
 
     def _threads(self) -> AbstractContextManager[None]:
-        """One thread for small windows, torch's own for whole frames."""
+        """Use one thread for small windows, and torch's own number for whole frames."""
         return single_threaded_torch() if len(self.networks) > 1 else nullcontext()
 
     def coarse(self, images: ArrayLike) -> Landmarks:
-        """Landmarks by the first stage alone."""
+        """Detect by the first stage alone."""
         found, stride = self._measured(self.frame_peaks(images), None, "frame"), self.frame_stride(np.asarray(images))
         u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
         return Landmarks(u, covariance, found.confidence).without_unsure()
 
     def searched(self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, *, sweep: bool = False) -> Landmarks:
-        """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
+        """Choose where the later stages start: at `rough`, or, if its window does not show it well, at the best candidate.
 
-        Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first is:
-        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.  With `sweep` the
-        candidates are those of `swept`.
+        Candidates are `rough` and tools made of the highest peaks of the first stage at several scales.  The second stage
+        looks at all of them once and at the likeliest ones again; the likeliest wins.  The second stage decides even if the
+        first is sure, since it was trained on negatives.  `seen` is the result of `stage_peaks` for `rough`, if known.  With
+        `sweep` the candidates are those of `swept`.
         """
         if self.tool_network is None:
             return rough
         result = Landmarks.join([rough])  # a copy
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
-        searched = height < _SHOWN
+        searched = height < _GOOD_HEIGHT
         for i in np.flatnonzero(searched):
             tools, u, once = self.swept(images[i]) if sweep else self.proposed(images[i], rough.u[i : i + 1])
-            best = np.argsort(-likelihood(u, once))[:_AGAIN]
+            best = np.argsort(-likelihood(u, once))[:_SECOND_LOOKS]
             u, twice = self._looked(images[i], u[best], "again")
             chosen = likelihood(u, twice).argmax()
             result.put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
@@ -352,9 +352,9 @@ class Detector:
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 
     def proposed(self, image: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Tools u (m, 3, 2) px that an image (h, w, 3) may show: `others`, and those that the first stage's peaks make.
+        """Candidate tools u (m, 3, 2) px in an image (h, w, 3): `others`, and combinations of the first stage's peaks.
 
-        Also what a look at each of them shows, u (m, 3, 2) px and the mean height (m,) of the peaks there.
+        Also returns what the second stage finds there: u (m, 3, 2) px and the mean height (m,) of the peaks.
         """
         u, height, one = [], [], image[None]
         for scale in _SCALES:
@@ -363,14 +363,14 @@ class Detector:
             u.append(image_from_cell(at, self.frame_stride(one, scale)))
             height.append(value)
         u, height = np.concatenate(u), np.concatenate(height)
-        which = best_tools(u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
+        which = best_tools(u, height, _CANDIDATES) if height.max() > _NO_PEAK else np.zeros((0, 3), int)
         tools = np.concatenate([*others, u[which, np.arange(3)]])
         return tools, *self._looked(image, tools, "tool")
 
     def swept(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `proposed`, but by the second stage, which sees the whole image (h, w, 3) at some scales and turns."""
+        """As `proposed`, but by the second stage, which sees the whole image (h, w, 3) at several scales and angles."""
         tools, height, sides = [], [], np.array(image.shape[1::-1])
-        for length, turn in product(_SWEPT, (2 * np.pi * np.arange(_TURNS) / _TURNS).tolist()):
+        for length, turn in product(_SWEEP_LENGTHS, (2 * np.pi * np.arange(_SWEEP_ANGLES) / _SWEEP_ANGLES).tolist()):
             zoom, (c, s) = view.tool_zoom(length * sides.max()), np.abs([np.cos(turn), np.sin(turn)])
             size = np.ceil(zoom * (np.array([[c, s], [s, c]]) @ sides)).astype(int)
             matrix = view.window_from_image((sides - 1) / 2, turn, size, zoom)
@@ -383,12 +383,12 @@ class Detector:
         return u, u, np.concatenate(height)
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
-        """`_shown` of several tools u (n, 3, 2) in one image."""
+        """`_shown` for several candidate tools u (n, 3, 2) px in one image."""
         return self._shown(self.stage_peaks(np.broadcast_to(image, (len(u), *image.shape)), u, stage), len(u))
 
     @staticmethod
     def _shown(seen: tuple, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks (n, 3, 2) that windows of n tools show, and the mean height (n,) of their peaks, by `stage_peaks`."""
+        """Convert the result of `stage_peaks` for n tools to landmarks (n, 3, 2) px and the peaks' mean height (n,)."""
         peaks, matrices, which = seen
         i, k = which.T
         found, height = np.full((n, 3, 2), np.nan), np.zeros((n, 3))
@@ -399,9 +399,9 @@ class Detector:
     def refine(
         self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None, *, only: np.ndarray | None = None
     ) -> Landmarks:
-        """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.
+        """Refine the landmarks `rough` by a later stage, or by ``"tracking"``.
 
-        `seen` is what `stage_peaks` gave for them, if that is known.  Closeups are of landmarks `only` (n, 3); others stay.
+        `seen` is the result of `stage_peaks` for them, if known.  `only` (n, 3) bool limits closeups to some landmarks.
         """
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
         result = Landmarks.join([rough])  # a copy
@@ -413,7 +413,7 @@ class Detector:
             near = peaks.value[:, 0].numpy() > 0
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
-            # The stage before decides whether the landmark is there; if a closeup is unsure, it stays where it was seen.
+            # The previous stage decides whether the landmark is there.  An unsure closeup does not move it.
             result.confidence[tuple(which[near & (confidence < MISSING_BELOW)].T)] = MISSING_BELOW
             near &= confidence >= MISSING_BELOW
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
@@ -422,7 +422,7 @@ class Detector:
         return result if stage == "tool" else result.without_unsure()  # the second look may be surer
 
     def rough_in_windows(self, rough: Landmarks, matrices: np.ndarray, which: np.ndarray, stage: str) -> Rough | None:
-        """What the stage before found, in the windows of this one; None where that is evidence of nothing."""
+        """The previous stage's result in the pixels of this stage's windows; None for tracking, where it is no evidence."""
         if stage == "tracking":
             return None
         i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
@@ -436,10 +436,10 @@ class Detector:
     def windows(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The inputs of a stage after the first, round rough landmarks u (n, 3, 2), of closeups the landmarks `only` (n, 3).
+        """Cut the inputs of a later stage around rough landmarks u (n, 3, 2); closeups may be limited to `only` (n, 3) bool.
 
-        Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
-        shows, or which image (m,) for the looks at the tool.  No tool without base or tips, and no missing landmark, has one.
+        Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and the index (m, 2) of the image and landmark in
+        each window, or of the image (m,) for the tool.  Missing landmarks, and tools without base or tips, have no window.
         """
         u = np.asarray(u, dtype=np.float64)
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)
@@ -456,14 +456,14 @@ class Detector:
         return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
     def outputs(self, images: np.ndarray, stage: str) -> Tensor:
-        """A stage's heatmaps (m, 3, h, w) of its input images (m, s, s, 3); of closeups the network's outputs (m, 4)."""
+        """Compute a stage's heatmaps (m, 3, h, w) of its inputs (m, s, s, 3), or an `OffsetNetwork`'s outputs (m, 4)."""
         with torch.inference_mode():
             return self._run[stage](as_tensor(images))[-1]
 
     def stage_peaks(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
     ) -> tuple[Peaks, np.ndarray, np.ndarray]:
-        """Peaks (m, 1) of a later stage, in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2)."""
+        """Peaks (m, 1) of a later stage in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2)."""
         windows, matrices, which = self.windows(images, u, stage, only)
         if not len(which):
             return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2), ()))), matrices, np.zeros((0, 2), int)
@@ -477,24 +477,24 @@ class Detector:
         return peaks, np.repeat(matrices, 3, axis=0), which
 
     def frame_stride(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:
-        """Image pixels per pixel of the first stage's input, along x and y; `scale` enlarges that."""
+        """Image pixels per pixel of the first stage's input, along x and y; `scale` is a factor on the input's size."""
         size = np.array(images.shape[2:0:-1])
         return size / np.maximum(np.round(size * (scale * (self.frame_px or size.max()) / size.max())), 1)
 
     def reduced(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:
-        """Images (n, h, w, 3) as the first stage sees them: the longer side has `scale` times `frame_px`."""
+        """Resize images (n, h, w, 3) for the first stage: the longer side becomes `scale` times `frame_px`."""
         stride = self.frame_stride(images, scale)
         if (stride == 1).all():
             return images
         size = tuple(int(v) for v in np.round(images.shape[2:0:-1] / stride))
-        how = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
-        if stride.min() >= 4:  # OpenCV is quick at halving
+        method = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
+        if stride.min() >= 4:  # halving first is faster in OpenCV
             half = tuple(side // 2 for side in images.shape[2:0:-1])
-            images = [cv2.resize(image, half, interpolation=how) for image in images]
-        return np.stack([cv2.resize(image, size, interpolation=how) for image in images])
+            images = [cv2.resize(image, half, interpolation=method) for image in images]
+        return np.stack([cv2.resize(image, size, interpolation=method) for image in images])
 
     def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
-        """Peaks as landmarks in pixels of the stage's input; `landmark` says which each peak is."""
+        """Convert peaks to landmarks in pixels of the stage's input; `landmark` is the index of each peak's landmark."""
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())

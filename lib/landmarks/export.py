@@ -1,12 +1,12 @@
 """The detector for other programs: each stage as ONNX with its decoding and error model inside, checked against torch.
 
-A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what `Landmarks` holds: u (n, 3, 2) px,
-covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them in pixels of the frame before it was
-resized.  The others but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks that the stage before found, in pixels
-of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``closeup``,
-``closer`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup`` corrects the
-landmarks of the stage before, unless it is unsure, ``closer`` those that ``closeup`` moved far (`windows.moved_far`), and
-``tracking`` those of the frame before.  Stages that share a network differ in their error models.
+A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w).  It returns the arrays of `Landmarks`: u (n, 3, 2) px,
+covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage returns them in pixels of the frame before it was
+resized.  All other stages but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks of the previous stage in pixels of
+their own input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``closeup``,
+``closer`` and ``tracking`` see a window of one landmark; of their output use only the row of that landmark.  ``closeup``
+corrects the landmarks of the previous stage unless it is unsure, ``closer`` those that ``closeup`` moved far
+(`windows.moved_far`), ``tracking`` those of the previous frame.  Stages that share a network differ in their error models.
 """
 
 import importlib.util
@@ -27,7 +27,7 @@ from lib.landmarks.network import as_tensor
 from lib.landmarks.windows import map_points
 from lib.recordings import Recording
 
-#: Largest differences from torch that an exported stage may show, by unit.
+#: Largest allowed differences between an exported stage and torch, by unit.
 LARGEST = {"px": 0.01, "of variance": 0.02, "of confidence": 0.001}
 
 
@@ -43,29 +43,29 @@ class StageWithDecoding(nn.Module):
         self.fit = detector.error_models.get(stage, ErrorModel())
 
     def forward(self, images: Tensor, *rough: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        seen = self.network(images)
+        output = self.network(images)
         if self.closeup:
-            # The graph does not know which landmark a closeup shows, so it corrects it as each of the three.
-            one = closeup_peaks(seen, self.config.size_px)
+            # The graph does not know which landmark a closeup shows, so it computes the correction for all three.
+            one = closeup_peaks(output, self.config.size_px)
             three = Peaks(*(part.expand(-1, 3, *part.shape[2:]) for part in one))
             peaks = corrected(three, self.fit, self.config.size_px, np.arange(3))
         else:
-            peaks = decode(seen, self.config.stride, method=self.method)
+            peaks = decode(output, self.config.stride, method=self.method)
         covariance, confidence = covariance_and_confidence(peaks, Rough.of(*rough) if rough else None, self.fit)
         stride = self.stride.to(peaks.u.dtype)
         return peaks.u * stride + (stride - 1) / 2, covariance * (stride[:, None] * stride), confidence
 
 
 def export(detector: Detector, folder: str | Path, examples: np.ndarray | None = None) -> dict[str, tuple[Path, float]]:
-    """Write every stage as ``STAGE.onnx`` into `folder`, if it agrees with torch.
+    """Write every stage that agrees with torch as ``STAGE.onnx`` into `folder`.
 
-    Returns the file of each stage, and its largest difference from torch in px, over landmarks that torch finds.
+    Returns for each stage the file and the largest difference from torch in px, over the landmarks that torch finds.
 
-    `examples` are frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording
-    that ships.  The exported first stage takes frames of this size.  A ValueError if a stage differs by more than `LARGEST`
-    (its file is not written), nothing is found in `examples`, or a package is missing.
+    The stages are compared on `examples`, frames (n, h, w, 3) uint8 with the tool in view; None = frames of the recording
+    that ships.  The exported first stage takes frames of this size.  Raises ValueError if a stage differs by more than
+    `LARGEST` (its file is then not written), if nothing is found in `examples`, or if a package is missing.
     """
-    for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
+    for package in ("onnx", "openvino"):  # onnx writes the files, openvino runs them for the comparison
         if not importlib.util.find_spec(package):
             raise ValueError(f"export: needs the package {package}, which is not installed here; `pip install {package}`.")
     if examples is None:
@@ -77,16 +77,16 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
     rough, stride = detector(examples), detector.frame_stride(examples)
     result = {}
     for stage in detector.stages:
-        images, evidence = detector.reduced(examples), ()
+        images, previous = detector.reduced(examples), ()
         if stage != "frame":
             images, matrices, which = detector.windows(examples, rough.u, stage)
             if stage != "tracking":
                 i = which[:, 0] if which.ndim == 2 else which
                 parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
-                evidence = tuple(torch.from_numpy(part).float() for part in parts)
+                previous = tuple(torch.from_numpy(part).float() for part in parts)
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
-        inputs = as_tensor(images).contiguous(), *evidence
+        inputs = as_tensor(images).contiguous(), *previous
         module = StageWithDecoding(detector, stage, stride).eval()
         path = folder / f"{stage}.onnx"
         with files.whole(path) as partial:
@@ -96,8 +96,8 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
 
 
 def run_onnx(path: str | Path, *inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """u, covariance and confidence that an exported stage gives, in float32, for images (n, 3, h, w) in [0, 1] and, if the
-    stage takes them, the rough landmarks and their confidence.
+    """Run an exported stage in float32 on images (n, 3, h, w) in [0, 1] and, if the stage takes them, on the rough landmarks
+    and their confidence.  Returns u, covariance and confidence.
     """
     core = openvino().Core()
     found = core.compile_model(core.read_model(str(path)), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})(list(inputs))
@@ -105,23 +105,23 @@ def run_onnx(path: str | Path, *inputs: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _write(module: nn.Module, example: tuple[Tensor, ...], path: Path) -> None:
-    names, inputs = ["u", "covariance", "confidence"], ["images", "rough_u", "rough_confidence"][: len(example)]
-    how = {"dynamo": False, "opset_version": 18, "dynamic_axes": {name: {0: "n"} for name in [*inputs, *names]}}
-    with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # sizes are fixed by tracing, as they shall be
-        torch.onnx.export(module, example, str(path), input_names=inputs, output_names=names, **how)
+    outputs, inputs = ["u", "covariance", "confidence"], ["images", "rough_u", "rough_confidence"][: len(example)]
+    options = {"dynamo": False, "opset_version": 18, "dynamic_axes": {name: {0: "n"} for name in [*inputs, *outputs]}}
+    with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # they say that tracing fixes the sizes: this is intended
+        torch.onnx.export(module, example, str(path), input_names=inputs, output_names=outputs, **options)
 
 
 def _difference(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, stage: str) -> float:
-    """The largest difference of ONNX from torch in px; `ValueError` if one exceeds `LARGEST`."""
+    """Returns the largest difference between ONNX and torch in px.  Raises ValueError if one exceeds `LARGEST`."""
     u, covariance, confidence = run_onnx(path, *(part.numpy() for part in inputs))
     with torch.inference_mode():
         u_torch, covariance_torch, confidence_torch = (part.numpy() for part in module(*inputs))
-    if not (seen := confidence_torch >= MISSING_BELOW).any():
+    if not (found := confidence_torch >= MISSING_BELOW).any():
         raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
     variance = np.trace(covariance_torch, axis1=-2, axis2=-1)[..., None, None]
     differences = {
-        "px": np.abs(u - u_torch)[seen].max(),
-        "of variance": (np.abs(covariance - covariance_torch) / variance)[seen].max(),
+        "px": np.abs(u - u_torch)[found].max(),
+        "of variance": (np.abs(covariance - covariance_torch) / variance)[found].max(),
         "of confidence": np.abs(confidence - confidence_torch).max(),
     }
     for unit, value in differences.items():

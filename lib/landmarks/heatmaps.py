@@ -1,7 +1,7 @@
-"""Heatmaps: Gaussian targets from float coordinates, and the decoders that read positions off them.
+"""Heatmaps: Gaussian targets for given positions, and the decoders that recover positions from heatmaps.
 
 Cells and pixels obey the half-pixel rule of `lib.geometry`: cell c of a heatmap of stride s is centred on pixel
-s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.
+s * c + (s - 1) / 2.  Sigma is in pixels of the network's input for every stride.
 """
 
 from typing import NamedTuple, Self
@@ -13,20 +13,20 @@ from torch import Tensor
 SIGMA_PX = 5.0
 #: The methods of `decode`.  Three more are compared in notebook 02 (`notebooks/studies/decoders.py`).
 DECODERS = ("paper", "gauss_newton")
-#: A fit ends when its steps, in cells and shares, are below this.
-_SETTLED = 1e-4
+#: A fit has converged if the steps of all parameters (positions in cells) are below this.
+_CONVERGED = 1e-4
 
 
 def sigma_cells(stride: int, sigma_px: float = SIGMA_PX) -> float:
-    """Sigma in cells, at least 0.6: a narrower Gaussian falls between the cells (the encoder's stride 64)."""
+    """Sigma in cells, at least 0.6: a narrower Gaussian would fall between the cells (at stride 64, of the encoder)."""
     return max(sigma_px / stride, 0.6)
 
 
 def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
-    """Gaussians of peak 1 centred on float coordinates: the l2 targets (paper Sec. III).
+    """Render Gaussians of height 1 at subpixel positions: the targets of the l2 loss (paper Sec. III).
 
     Takes points u (n, k, 2) px of an input of size (h, w), and returns heatmaps (n, k, ceil(h / stride), ceil(w / stride)).
-    A point that is NaN gives an empty heatmap.
+    The heatmap of a NaN point is 0 everywhere.
 
     >>> heatmaps = render(torch.tensor([[[5.5, 9.5]]]), (16, 32), 4)
     >>> heatmaps.shape, heatmaps[0, 0, 2, 1].item()
@@ -45,10 +45,10 @@ class Peaks(NamedTuple):
 
     Attributes:
         u: (n, k, 2) px of the network's input.
-        value: (n, k) height of the peak; that of the target is 1.
-        width: (n, k) sigma of the peak over that of the target; 1 where the decoder does not fit it.
-        covariance: (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
-        rival: (n, k) height of the heatmap elsewhere, that is more than 3 sigma away.
+        value: (n, k) height of the heatmap's highest cell; the target's peak has height 1.
+        width: (n, k) sigma of the peak divided by that of the target; 1 if the decoder does not fit it.
+        covariance: (n, k, 2, 2) px^2, from the residuals of the fit; NaN if the decoder gives none.
+        rival: (n, k) largest value of the heatmap more than 3 sigma from the peak.
     """
 
     u: Tensor
@@ -63,7 +63,7 @@ class Peaks(NamedTuple):
 
 
 def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Square neighbourhoods: values (n, k, p), offsets (p, 2) from `centre` in cells, inside (n, k, p) bool."""
+    """Square neighbourhoods: values (n, k, p), offsets (p, 2) from `centre` in cells, mask (n, k, p) of cells inside."""
     h, w = heatmaps.shape[-2:]
     side = torch.arange(-radius, radius + 1, device=heatmaps.device)
     dy, dx = torch.meshgrid(side, side, indexing="ij")
@@ -75,24 +75,24 @@ def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Ten
 
 
 def disc_mean(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """The mean of Eq. (1) over its disc Delta, weighted by p, in cells, and the height of the highest cell."""
+    """Position of the peak in cells, the mean over the disc Delta of Eq. (1) weighted by p, and the highest cell's value."""
     if not torch.onnx.is_in_onnx_export() and not torch.isfinite(heatmaps).all():
         raise ValueError("heatmaps: not finite; the network or its input is broken (look for NaN in the images).")
     value, flat = heatmaps.flatten(-2).max(-1)
     w = heatmaps.shape[-1]
     cell = torch.stack([flat % w, torch.div(flat, w, rounding_mode="floor")], -1)
     p, offsets, inside = _patches(heatmaps, cell, int(3 * sigma))
-    # A regressed activation can be negative, a probability cannot.
+    # The network's outputs can be negative, probabilities cannot.
     weights = p.clamp_min(0) * inside * (offsets.square().sum(-1) <= (3 * sigma) ** 2)
     total = weights.sum(-1, keepdim=True)
     return cell.to(heatmaps.dtype) + (weights @ offsets) / total.clamp_min(torch.finfo(total.dtype).tiny), value
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """X (..., n, m) of matrix (..., n, n) X = right; matrix positive definite."""
+    """Solve matrix (..., n, n) X = right for X (..., n, m); the matrix must be positive definite."""
     if not torch.onnx.is_in_onnx_export():
         return torch.linalg.solve(matrix, right)
-    # ONNX has no solver: Gauss-Jordan, which needs no pivoting here.
+    # ONNX has no solver, so eliminate (Gauss-Jordan); a positive definite matrix needs no pivoting.
     n, both = matrix.shape[-1], torch.cat([matrix, right], -1)
     for i in range(n):
         row = both[..., i : i + 1, :] / both[..., i : i + 1, i : i + 1]
@@ -102,10 +102,10 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Least-squares fit of a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc, started from the paper's disc centroid.
+    """Fit a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc by least squares, started from the paper's disc centroid.
 
-    The five unknowns are x, y, width w, height a and offset b.  Steps are damped and limited.  A fit that leaves the disc
-    or ends with a width below 0.4 or above 2.5 falls back to the centroid, with a wide covariance.
+    The five unknowns are x, y, width w, height a and offset b.  Steps are damped and limited.  A fit that leaves the disc, or
+    has a width below 0.4 or above 2.5, is replaced by the centroid with variance sigma^2.  Returns x and y, w, covariance.
     """
     h, w = heatmaps.shape[-2:]
     cell = torch.minimum(start.round().long().clamp_min(0), torch.tensor([w - 1, h - 1], device=heatmaps.device))
@@ -127,17 +127,17 @@ def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) 
 
     eye = torch.eye(5, dtype=torch.float64, device=p.device)
     bounds = [[0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], [torch.inf, torch.inf, 3.0, torch.inf, torch.inf]]
-    longest, most = torch.tensor(bounds, dtype=torch.float64, device=p.device)
-    least = torch.where(most < torch.inf, 0.3, -torch.inf)
-    settled = torch.zeros_like(one, dtype=torch.bool)  # peak by peak: what else the batch holds changes none
+    step_limit, upper = torch.tensor(bounds, dtype=torch.float64, device=p.device)
+    lower = torch.where(upper < torch.inf, 0.3, -torch.inf)
+    converged = torch.zeros_like(one, dtype=torch.bool)  # by peak: no peak's result depends on the rest of the batch
     for _ in range(6):
         residual, jacobian = model(theta)
-        transposed = jacobian.transpose(-1, -2)  # ONNX does not know .mT
+        transposed = jacobian.transpose(-1, -2)  # ONNX lacks .mT
         step = _solve(transposed @ jacobian + 1e-6 * eye, transposed @ residual[..., None])[..., 0]
-        step = torch.maximum(torch.minimum(step, longest), -longest).masked_fill(settled[..., None], 0.0)
-        theta = torch.maximum(torch.minimum(theta + step, most), least)
-        settled = settled | (step.abs() < _SETTLED).all(-1)
-        if not torch.onnx.is_in_onnx_export() and settled.all():
+        step = torch.maximum(torch.minimum(step, step_limit), -step_limit).masked_fill(converged[..., None], 0.0)
+        theta = torch.maximum(torch.minimum(theta + step, upper), lower)
+        converged = converged | (step.abs() < _CONVERGED).all(-1)
+        if not torch.onnx.is_in_onnx_export() and converged.all():
             break
     residual, jacobian = model(theta)
     variance = residual.square().sum(-1) / (weight.sum(-1) - 5).clamp_min(1) + 1e-8
@@ -146,20 +146,20 @@ def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) 
     covariance = variance[..., None, None] * _solve(normal, unit)[..., :2, :]
     width = theta[..., 2]
     near = (theta[..., :2].square().sum(-1) <= reach**2) & (width > 0.4) & (width < 2.5)
-    good = near & (theta.abs() < torch.inf).all(-1) & (theta[..., 3] > 0)  # NaN is not below infinity
+    good = near & (theta.abs() < torch.inf).all(-1) & (theta[..., 3] > 0)  # NaN is not good
     u = torch.where(good[..., None], cell + theta[..., :2], start.double())
     covariance = torch.where(good[..., None, None], covariance, sigma**2 * eye[:2, :2])
     return u, torch.where(good, width, torch.full_like(width, 3.0)), covariance
 
 
 def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma_px: float = SIGMA_PX) -> Peaks:
-    """The peak of every heatmap (n, k, h, w) of `stride` input pixels per cell, in pixels of the network's input.
+    """Find the peak of every heatmap (n, k, h, w) of `stride` input pixels per cell, in pixels of the network's input.
 
     Args:
-        method: ``"paper"``: the centroid of the disc of 3 sigma around the highest cell, Eq. (1) divided by the sum of p (as
-            printed it is divided by the disc's area, which is no mean); ``"gauss_newton"``: a Gaussian fit, with covariance.
+        method: ``"paper"``: the weighted centroid of the disc of 3 sigma around the highest cell, Eq. (1) divided by the sum
+            of p (the paper prints the disc's area, which gives no mean); ``"gauss_newton"``: a Gaussian fit, with covariance.
 
-    A ValueError for an unknown method and for heatmaps of another shape or not finite.
+    Raises ValueError for an unknown method, and for heatmaps that have another shape or are not finite.
 
     >>> heatmaps = render(torch.tensor([[[20.3, 12.8]]], dtype=torch.float64), (64, 64), 4)
     >>> decode(heatmaps, 4).u.round(decimals=3).tolist()

@@ -1,4 +1,4 @@
-"""How good detections are: PCK, errors in pixels, and whether covariance and confidence are true."""
+"""Accuracy of detections: PCK, errors in pixels, and the calibration of covariance and confidence."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-#: The paper's range of thresholds, as parts of the tool's length.
+#: The paper's range of thresholds, as fractions of the tool's length.
 PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)
-#: A larger error is gross: no covariance means to explain it.
+#: A larger error is gross: the predicted covariance is not meant to cover it.
 GROSS_PX = 20.0
 
 
@@ -20,16 +20,16 @@ def _pairs(u: ArrayLike, u_true: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors_px(u: ArrayLike, u_true: ArrayLike) -> np.ndarray:
-    """Distance (n, 3) of detections (n, 3, 2) from labels: infinite where nothing was detected, NaN without a label."""
+    """Distances (n, 3) px between detections and labels (n, 3, 2): infinite if nothing was detected, NaN without a label."""
     u, u_true = _pairs(u, u_true)
     error = np.linalg.norm(u - u_true, axis=2)
     return np.where(np.isfinite(u_true).all(axis=2), np.where(np.isfinite(error), error, np.inf), np.nan)
 
 
 def tool_length_px(u_true: ArrayLike) -> np.ndarray:
-    """Mean distance (...) of labelled tips (..., 3, 2) from the base, the PCK's unit; NaN without a base or without a tip.
+    """Mean distance (...) of the labelled tips of u_true (..., 3, 2) from the base; NaN without a base or without a tip.
 
-    The paper normalises by "the distance of the tool-tip from its base" and leaves open which tip.
+    PCK is relative to it.  The paper normalises by "the distance of the tool-tip from its base" and leaves open which tip.
     """
     u_true = np.asarray(u_true, dtype=np.float64)
     distance = np.linalg.norm(u_true[..., 1:, :] - u_true[..., :1, :], axis=-1)
@@ -38,11 +38,11 @@ def tool_length_px(u_true: ArrayLike) -> np.ndarray:
 
 
 def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, *, length_px: ArrayLike | None = None):
-    """Percentage of correct keypoints (paper Sec. V-B): nearer to the label than `threshold` times the tool's length.
+    """Percentage of correct keypoints (paper Sec. V-B): those within `threshold` times the tool's length of the label.
 
     Takes detections and labels (n, 3, 2) px.  A missing detection counts as wrong, a missing label is not counted.
-    `length_px` (n,) are the tool's lengths, None = from the labels; frames without one are not counted.
-    Returns percent, a float or (t,) as `threshold`; NaN where no label counts.
+    `length_px` (n,) are the tool's lengths, None = from the labels; frames of unknown length are not counted.
+    Returns percent, a float or (t,) as `threshold`; NaN if no label counts.
 
     >>> u_true = np.array([[[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]])
     >>> pck(u_true + [[[3, 0], [6, 0], [0, 0]]], u_true, [0.02, 0.05, 0.1]).round(1).tolist()
@@ -58,7 +58,7 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
 
 
 def nees(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike) -> np.ndarray:
-    """Normalised estimation error squared (n, 3): mean 2 and chi-square with 2 degrees where covariances are true."""
+    """Normalised estimation error squared (n, 3): chi-square with 2 degrees of freedom if the covariances are right."""
     u, u_true = _pairs(u, u_true)
     covariance = np.asarray(covariance, dtype=np.float64)
     known = np.isfinite(u - u_true).all(2) & np.isfinite(covariance).all((2, 3))
@@ -68,7 +68,7 @@ def nees(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike) -> np.ndarray:
 
 
 def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean confidence, fraction correct and count per bin of confidence, (bins,) each; NaN for empty bins."""
+    """Mean confidence, fraction correct and count in each bin of confidence, (bins,) each; NaN for empty bins."""
     confidence, correct = np.ravel(confidence).astype(float), np.ravel(correct).astype(float)
     which = np.clip((confidence * bins).astype(int), 0, bins - 1)
     count = np.bincount(which, minlength=bins)
@@ -88,8 +88,8 @@ class Scores:
     """The numbers of an evaluation: percent, pixels, counts.
 
     `median_px` and `p95_px` are over detected landmarks with a label.  `missed` counts labels without a detection, which
-    PCK counts as wrong; `gross` counts errors beyond `GROSS_PX`, which `bias_px`, `nees` (the mean) and `coverage_95` leave
-    out.  `coverage_95` is the percentage inside the ellipse that should hold 95 %.
+    PCK counts as wrong.  `gross` counts errors of `GROSS_PX` or more; `bias_px`, `nees` (the mean) and `coverage_95` exclude
+    them.  `coverage_95` is the percentage of errors inside the 95 % ellipse.
     """
 
     pck_0_01: float
@@ -107,7 +107,7 @@ class Scores:
 
 
 def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, *, length_px=None) -> Scores:
-    """All numbers at once; arguments as in `pck` and `nees`."""
+    """Compute all numbers; arguments as in `pck` and `nees`."""
     u, u_true = _pairs(u, u_true)
     error = errors_px(u, u_true)
     found, fine = error[np.isfinite(error)], error < GROSS_PX

@@ -1,9 +1,9 @@
 """The networks: the Stacked Hourglass (Newell et al. 2016; paper Sec. III) and the offset network for closeups.
 
-The hourglass is one class with the paper's five configurations.  Each of its layers keeps the half-pixel rule of
+`StackedHourglass` has the paper's five configurations.  Each of its layers keeps the half-pixel rule of
 `lib.geometry`: the stem's even kernel is centred on its cell, pooling and nearest-neighbour upsampling are aligned with
 cell borders.  So the centre of heatmap cell c lies at pixel stride * c + (stride - 1) / 2 of the input before any training.
-The offset network is not in the paper: it measures one landmark that a hourglass has found.
+The offset network is not in the paper: it measures one landmark that an hourglass has found.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class HourglassConfig:
     """Configuration of a `StackedHourglass`.
 
     Attributes:
-        features: Channels of the hourglass, an even number.  The paper does not state it; notebook 02 finds it below 256.
-        stacks: Hourglasses in a row, each supervised.
-        depth: Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
-        growth: By how much the channels multiply with each halving; 1 as in the paper.
+        features: Number of channels, even.  The paper does not state it; notebook 02 concludes that it is below 256.
+        stacks: Number of hourglasses in a row, each supervised.
+        depth: Number of halvings inside an hourglass; with 4, inputs are padded to a multiple of 4 * 2**4 = 64.
+        growth: Factor on the number of channels at each halving; 1 in the paper.
         decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the stride is 4 * 2**depth.
 
         >>> HourglassConfig().stride, HourglassConfig(stacks=1, decoder=False, skips=False).stride
@@ -74,12 +74,12 @@ def _conv(inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu: bool
 
 
 class Network(nn.Module):
-    """What the networks share: a configuration, and a form for inference."""
+    """Base class of the networks: a configuration, and copies for storage and for inference."""
 
     config: HourglassConfig | OffsetConfig
 
     def halved(self) -> Self:
-        """A copy with all weights rounded to half precision, which its file then holds in half the place."""
+        """A copy with all weights rounded to half precision, so that its file has half the size."""
         return copy.deepcopy(self).half().float()
 
     def fused(self) -> Self:
@@ -95,7 +95,7 @@ class Network(nn.Module):
 
 
 class _Block(nn.Module):
-    """A body and what skips it, if anything does."""
+    """A body and its skip connection, if any."""
 
     def __init__(self, body: nn.Module, skip: nn.Module | None = None):
         super().__init__()
@@ -115,14 +115,14 @@ def _box(inputs: int, outputs: int, residual: bool) -> _Block:
 
 
 def _residual(inputs: int, outputs: int) -> _Block:
-    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); more channels come with half the resolution."""
+    """Two 3 x 3 convolutions with a skip connection (He et al. 2016), which halve the resolution if they add channels."""
     halve = inputs != outputs
     body = nn.Sequential(_conv(inputs, outputs, 3, stride=2 if halve else 1), _conv(outputs, outputs, 3, relu=False))
     return _Block(body, nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity())
 
 
 class _Hourglass(nn.Module):
-    """Halve, process (recursively), double, and add what the skip connection kept."""
+    """Halve the resolution, process (recursively), double it, and add the skip connection."""
 
     def __init__(self, config: HourglassConfig, depth: int, f: int):
         super().__init__()
@@ -141,11 +141,11 @@ class _Hourglass(nn.Module):
 
 
 class StackedHourglass(Network):
-    """Images to landmark heatmaps.
+    """Computes landmark heatmaps from images.
 
     ``forward(images)`` takes float images (n, 3, h, w) in [0, 1], RGB, of any size, pads them with zeros at the right
     and bottom, and returns one (n, 3, ceil(h / stride), ceil(w / stride)) heatmap tensor per stack, the final one last.
-    It raises `ValueError` if the images do not have three channels.
+    It raises ValueError if the images do not have three channels.
 
     >>> heatmaps = StackedHourglass(HourglassConfig(features=8))(torch.zeros(1, 3, 60, 100))
     >>> len(heatmaps), heatmaps[-1].shape
@@ -169,7 +169,7 @@ class StackedHourglass(Network):
         between = stacks[:-1]
         self.merge_features = nn.ModuleList([nn.Conv2d(f, f, 1) for _ in between])
         self.merge_heatmaps = nn.ModuleList([nn.Conv2d(len(LANDMARKS), f, 1) for _ in between])
-        for head in self.heads:  # targets are almost everywhere 0: start there
+        for head in self.heads:  # almost all of a target is 0, so the outputs start near 0
             nn.init.normal_(head.weight, std=1e-3)
             nn.init.zeros_(head.bias)
 
@@ -209,11 +209,11 @@ class OffsetConfig:
 
 
 class OffsetNetwork(Network):
-    """Closeups to the offset of their landmark from the centre, and the scale of its error.
+    """Predicts from a closeup the offset of the landmark from the centre, and the scale of the offset's error.
 
-    ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns, as the hourglass does, a list, of one
-    tensor (n, 4): the offset along x and y in pixels, and the logarithms of the scales of its errors in pixels, limited to
-    -6 to 5.  It raises `ValueError` if the images have another size.
+    ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns a list, as the hourglass does, with one
+    tensor (n, 4): the offset along x and y in pixels, and the logarithms of the scales of their errors in pixels, limited to
+    -6 to 5.  It raises ValueError if the images have another size.
 
     >>> OffsetNetwork(OffsetConfig(features=8)).eval()(torch.zeros(2, 3, 64, 64))[0].shape
     torch.Size([2, 4])
@@ -227,10 +227,10 @@ class OffsetNetwork(Network):
             _conv(3, f, 5, stride=2), _residual(f, f), _residual(f, 2 * f), _residual(2 * f, 2 * f),
             _residual(2 * f, 3 * f), _residual(3 * f, 3 * f), _residual(3 * f, 4 * f),
         )  # fmt: skip
-        # Fully connected, because a mean over the closeup would lose where something is seen.
+        # Fully connected, because a mean over the closeup would lose the positions of what it shows.
         side = config.size_px // 16
         self.head = nn.Sequential(nn.Flatten(), nn.Linear(4 * f * side**2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4))
-        nn.init.zeros_(self.head[-1].weight)  # the start: in the middle, within about a pixel
+        nn.init.zeros_(self.head[-1].weight)  # the first prediction is the centre, with an error scale of 1 px
         nn.init.zeros_(self.head[-1].bias)
 
     def forward(self, images: Tensor) -> list[Tensor]:
@@ -242,14 +242,14 @@ class OffsetNetwork(Network):
 
 
 def network_of(config: HourglassConfig | OffsetConfig) -> Network:
-    """A new network of a configuration."""
+    """Make a new network of this configuration."""
     return OffsetNetwork(config) if isinstance(config, OffsetConfig) else StackedHourglass(config)
 
 
 def as_uint8(images: ArrayLike) -> np.ndarray:
-    """Images (n, h, w, 3), or grey (n, h, w, 1), uint8 or float in [0, 1], as (n, h, w, 3) uint8.
+    """Convert images (n, h, w, 3), or grey (n, h, w, 1), uint8 or float in [0, 1], to (n, h, w, 3) uint8.
 
-    Raises `ValueError` for another shape, type or range.
+    Raises ValueError for another shape, type or range.
 
     >>> as_uint8(np.full((1, 2, 4, 3), 0.5)).max()
     np.uint8(128)
@@ -273,5 +273,5 @@ def as_uint8(images: ArrayLike) -> np.ndarray:
 
 
 def as_tensor(images: ArrayLike) -> Tensor:
-    """The same images as the networks take them: (n, 3, h, w) float in [0, 1], channels last."""
+    """Convert images, as `as_uint8` takes them, to the networks' input: (n, 3, h, w) float in [0, 1], channels last."""
     return torch.from_numpy(np.ascontiguousarray(as_uint8(images))).permute(0, 3, 1, 2).float().div_(255.0)

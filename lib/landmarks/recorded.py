@@ -1,4 +1,4 @@
-"""The detector over a recording, and detections that notebooks of one run, or commands, share: no pair is looked at twice."""
+"""Detection in a recording, and a cache through which notebooks of a run, or commands, share the detections of a pair."""
 
 import os
 import time
@@ -20,13 +20,13 @@ def detect(
 ) -> Correspondences:
     """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
 
-    Returns three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant, and NaN where a landmark
-    is missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
+    Returns three rows per frame (base, tip_1, tip_2), each with the robot's position at that time.  A missing landmark is
+    NaN.  `Correspondences.complete` keeps the rows that both cameras and the robot have.
 
     Args:
-        detector: None is the one that ships.
-        frames: Which frames; None is all.
-        track: Follow the landmarks from frame to frame (`Detector.track`): several times faster if frames follow each other.
+        detector: None = the one that ships.
+        frames: Which frames; None = all.
+        track: Follow the landmarks from frame to frame (`Detector.track`), several times faster in consecutive frames.
 
         >>> from lib import paths
         >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
@@ -47,9 +47,9 @@ def detect(
 
 
 def with_ground(detector: Callable, recording: Recording | GrowingGround, change: Callable | None = None) -> dict:
-    """What a call of the detector takes beside a pair of images: their ground, unless it is a stand-in of images alone.
+    """Keyword arguments of a detector's call: the ground of the images.  Empty for a function that takes images alone.
 
-    `change` made the images of those of the recording.
+    `change` is the function that made the images from those of the recording; the ground is changed likewise.
 
     >>> with_ground(lambda images: Landmarks.none(len(images)), None)
     {}
@@ -60,15 +60,15 @@ def with_ground(detector: Callable, recording: Recording | GrowingGround, change
 
 
 class SharedDetector:
-    """A detector for `detect` and `assess` that reads what was found in the same images before.
+    """A detector for `detect` and `assess` that caches its results in a folder and reads them for images seen before.
 
-    `python3 -m lib` names a folder for that in the environment: `run` one of its own, which it removes at its end, other
-    commands one in data/cache.  Anywhere else this is the detector itself.  A file's name is the digest of the images'
-    pixels, the ground's key, the weights, the settings and the engine.  Where a time is measured, call the detector itself.
+    An environment variable set by `python3 -m lib` names the folder: `run` makes its own and removes it at its end, other
+    commands use one in data/cache.  Without it nothing is cached.  A file's name is the digest of the images' pixels, the
+    ground's key, the weights, the settings and the engine.  To measure times, call the detector itself.
 
     Attributes:
-        seconds: What detecting took: here, and where it was read, there.
-        pairs, read: How many calls there were, and how many of them were read.
+        seconds: Time that the detections took, in s; for those read from the cache, the time when they were made.
+        pairs, read: Number of calls, and of those answered from the cache.
 
         >>> detector = SharedDetector(lambda images: Landmarks.none(len(images)))
         >>> len(detector(np.zeros((2, 8, 8, 3), np.uint8))), detector.pairs, detector.read
@@ -82,26 +82,26 @@ class SharedDetector:
         self._folder = os.environ.get(paths.SHARED_VARIABLE) if self._digest else None
 
     def __call__(self, images: np.ndarray, *, ground: Ground | None = None) -> Landmarks:
-        """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB; `ground` as in a `Detector`'s call."""
+        """Detect the landmarks of a stereo pair (2, h, w, 3), uint8 RGB; `ground` as in a `Detector`'s call."""
         self.pairs, file = self.pairs + 1, None
         if self._folder:
             content = f"{self._digest} {images.dtype} {images.shape} {ground and ground.key}".encode() + images.tobytes()
             file = Path(self._folder) / f"{files.digest(content, length=64)}.npz"
             if file.is_file():
-                with np.load(file) as kept:
-                    self.read, self.seconds = self.read + 1, self.seconds + float(kept["seconds"])
-                    return Landmarks(kept["u"], kept["covariance"], kept["confidence"])
+                with np.load(file) as cached:
+                    self.read, self.seconds = self.read + 1, self.seconds + float(cached["seconds"])
+                    return Landmarks(cached["u"], cached["covariance"], cached["confidence"])
         start = time.perf_counter()
         found = self.detector(images, **({"ground": ground} if isinstance(self.detector, Detector) else {}))
         seconds = time.perf_counter() - start
         self.seconds += seconds
         if file:
-            with suppress(OSError), files.whole(file) as partial:  # a full disk costs time, not the notebook
+            with suppress(OSError), files.whole(file) as partial:  # a full disk must not stop a notebook
                 np.savez(partial, **vars(found), seconds=seconds)
         return found
 
     def __str__(self) -> str:
-        """Where the detections come from, in one sentence."""
+        """One sentence on how many detections were computed or read, and their time."""
         if not self.read:
             return f"Detected in {self.pairs} stereo pairs, {self.seconds:.1f} s."
         seconds = f"finding them took {self.seconds:.1f} s"

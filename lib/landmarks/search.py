@@ -1,4 +1,4 @@
-"""Where else the tool may lie: the first stage's highest peaks, at several scales, put together to tools."""
+"""Candidates for the tool, put together from the highest peaks of the first stage."""
 
 import numpy as np
 import torch
@@ -6,20 +6,20 @@ import torch
 from lib.landmarks.heatmaps import SIGMA_PX, disc_mean, sigma_cells
 from lib.landmarks.metrics import tool_length_px
 
-#: Peaks that are taken from each heatmap.
+#: Number of peaks taken from each heatmap.
 PEAKS = 4
-#: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.
+#: Two tools count as one if the mean distance between their landmarks is at most this share of the length.
 _SAME = 0.25
-#: What jaws that are open by the tool's length add to the mean height of its peaks, chosen on validation scenes.
-_OPEN = 0.25
+#: Weight of the jaws' opening, relative to the tool's length, in a score; chosen on validation scenes.
+_OPENING_WEIGHT = 0.25
 
 
 def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """The `n` highest peaks of heatmaps (m, k, h, w), over 3 sigma apart: centroids (n m, k, 2) px and heights (n m, k)."""
+    """Find the `n` highest peaks of heatmaps (m, k, h, w), 3 sigma apart: centroids (n m, k, 2) px and heights (n m, k)."""
     rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
     sigma, found = sigma_cells(stride, SIGMA_PX), []
     for _ in range(n):
-        found.append(disc_mean(heatmaps, sigma))  # no finer: a window, which shows more, is looked at next
+        found.append(disc_mean(heatmaps, sigma))  # accurate enough: the next stage measures in a window
         x, y = found[-1][0][..., None, None].unbind(2)
         heatmaps = heatmaps.masked_fill((columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma) ** 2, -1.0)
     u, value = (torch.cat(part) for part in zip(*found, strict=True))
@@ -27,10 +27,10 @@ def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarr
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
-    """The `n` likeliest tools that peaks u (k, 3, 2) px of heights (k, 3) make: (m, 3), the peak of each landmark.
+    """Combine peaks u (k, 3, 2) px of heights (k, 3) to the `n` likeliest tools, or fewer: (m, 3), each landmark's peak.
 
-    A tool is likely if its peaks are high, its jaws are about equally long and no further apart than they are long, and
-    tip_1 lies on the left as seen along the tool.  Tools that look alike count once.
+    A tool is likely if its peaks are high, if its jaws are about equally long and no farther apart than they are long, and if
+    tip_1 lies on the left for a view along the tool.  Of similar tools only the likeliest is returned.
 
     >>> u = np.array([[[0, 0], [9, -2], [90, 2]], [[0, 1], [80, 9], [9, 2]]])
     >>> best_tools(u, np.array([[1.0, 1.0, 0.8], [0.2, 0.7, 0.5]]), 1)
@@ -54,6 +54,6 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
 
 
 def likelihood(u: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws."""
+    """Score tools u (n, 3, 2) px by their peaks' mean height (n,) and their opening, as a rod looks like shut jaws: (n,)."""
     opening = np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0)
-    return height + _OPEN * np.nan_to_num(opening)
+    return height + _OPENING_WEIGHT * np.nan_to_num(opening)

@@ -1,8 +1,8 @@
 """Windows around landmarks: upright crops in which the tool points right.
 
-The later stages of the detector see small windows.  Each is turned so that the direction from base to tips points right and
-tip_1, the left tip as seen along the tool, lies above.  So the network sees one pose whatever the tool's direction in the
-image.  The tool's window is scaled so that every tool fills the same share of it.  Closeups are reduced a little, and
+The later stages of the detector see small windows.  Each is rotated so that the direction from base to tips points right and
+tip_1, the left tip for a view along the tool, lies above.  So the network sees one pose, whatever the tool's direction in the
+image.  The tool's window is scaled so that every tool fills the same share of it.  Closeups are scaled down a little, and
 mirrored for tip_2, so that both tips look alike.
 """
 
@@ -12,24 +12,24 @@ from numpy.typing import ArrayLike
 
 from lib.landmarks.metrics import tool_length_px
 
-#: Side of the tool's window, and the tool's length in it.
+#: Side of the tool's window, and length of the tool in it.
 TOOL_PX, _TOOL_LENGTH_PX = 128, 56.0
-#: Closeups of tools of these lengths, in image pixels, have one scale, which uses all of the image's resolution.
+#: Closeups of tools of these lengths, in image pixels, have scale 1.  Other tools are scaled to the nearer of these lengths.
 _SAME_SCALE_PX = (165.0, 450.0)
 
-#: Closeup pixels per image pixel, of base, tip_1 and tip_2: the base shows between the edges of the shaft.
+#: Closeup pixels per image pixel, for base, tip_1 and tip_2.  At the base the closeup must show both edges of the shaft.
 CLOSEUP_ZOOM = (0.65, 0.85, 0.85)
-#: How far behind its landmark, along the tool, a closeup is centred, image pixels: how a jaw tapers tells where it ends.
+#: Image pixels from a landmark back along the tool to the centre of its closeup: the taper of a jaw shows where it ends.
 CLOSEUP_BEHIND_PX = (0.0, 18.0, 18.0)
-#: A closeup counts only if it sees its landmark nearer than this to where it was expected, image pixels.
+#: A closeup counts only if it finds its landmark within this distance of the expected position, image pixels.
 CLOSEUP_REACH_PX = 20.0
-#: A landmark that a closeup moved farther than this, in closeups of scale 1, gets a second one.  After a shorter way one
-#: closeup is as exact, as validation images of other eyes and tools say.
+#: A landmark gets a second closeup if the first moved it by more than this, in image pixels times `closeup_scale`.  After
+#: shorter moves a second one is no more accurate, on validation images of other eyes and tools.
 _SECOND_LOOK_PX = 4.0
 
 
 def tool_pose(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Middle (n, 2) between the base and the mean of the known tips, and the direction (n,) from base to tips in rad.
+    """Midpoint (n, 2) between the base and the mean of the known tips, and direction (n,) from base to tips in rad.
 
     The angle runs from x towards y.  Both are NaN without a base or without a tip.
 
@@ -44,7 +44,7 @@ def tool_pose(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_zoom(length_px: ArrayLike) -> np.ndarray:
-    """Pixels of the tool's window per image pixel, for tools of some lengths.
+    """Pixels of the tool's window per image pixel, for tools of length `length_px` in the image.
 
     >>> float(tool_zoom(28.0))
     2.0
@@ -53,8 +53,8 @@ def tool_zoom(length_px: ArrayLike) -> np.ndarray:
 
 
 def closeup_scale(length_px: ArrayLike) -> np.ndarray:
-    """By how much closeups of tools of some lengths are magnified beyond `CLOSEUP_ZOOM`; never to less than half an image
-    pixel, since there is nothing more to see.
+    """Magnification of closeups relative to `CLOSEUP_ZOOM`, for tools of length `length_px`.  It is limited so that a closeup
+    pixel is at least half an image pixel wide, since a closeup cannot show more than the image.
 
     >>> closeup_scale([900, 300, 110, 20]).round(2).tolist()
     [0.5, 1.0, 1.5, 2.35]
@@ -64,7 +64,7 @@ def closeup_scale(length_px: ArrayLike) -> np.ndarray:
 
 
 def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: ArrayLike, zoom: ArrayLike = 1.0) -> np.ndarray:
-    """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2), the middle of a window of `size`, side or (w, h)."""
+    """Matrices (..., 2, 3) that turn by -angle, scale, and move `centre` (..., 2) to the middle of `size`, side or (w, h)."""
     centre, angle = np.asarray(centre, dtype=np.float64), np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle) * zoom, np.sin(angle) * zoom
     linear = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
@@ -75,8 +75,8 @@ def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: ArrayLike, 
 def closeup_from_image(
     centre: ArrayLike, angle_rad: ArrayLike, size: int, landmark: ArrayLike, length_px: ArrayLike = 300.0
 ) -> np.ndarray:
-    """Matrices (..., 2, 3) like `window_from_image`, of `CLOSEUP_ZOOM` times `closeup_scale`, mirrored for tip_2, and centred
-    behind `centre` (..., 2), where the landmark (...) is thought to lie; `angle_rad` and the tool's `length_px` are (...).
+    """Matrices (..., 2, 3) from image to closeup, like `window_from_image`: zoomed by `CLOSEUP_ZOOM` times `closeup_scale`,
+    mirrored for tip_2, and centred `CLOSEUP_BEHIND_PX` behind `centre` (..., 2), the expected position of the landmark.
     """
     landmark, angle, scale = np.asarray(landmark), np.asarray(angle_rad, dtype=np.float64), closeup_scale(length_px)
     behind = (np.array(CLOSEUP_BEHIND_PX)[landmark] / scale)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -87,7 +87,7 @@ def closeup_from_image(
 
 
 def moved_far(before: ArrayLike, after: ArrayLike) -> np.ndarray:
-    """(n, 3) which landmarks a closeup moved so far, from `before` to `after` (n, 3, 2), that another measures them better.
+    """(n, 3) bool: landmarks that a closeup moved so far, from `before` to `after` (n, 3, 2), that a second one is worth it.
 
     >>> tool = np.array([[[0, 0], [300, -9], [300, 9]]])
     >>> moved_far(tool, tool + [[5, 0], [3, 0], [np.nan, 0]]).tolist()
@@ -98,27 +98,27 @@ def moved_far(before: ArrayLike, after: ArrayLike) -> np.ndarray:
 
 
 def expected_in_closeup(size: int, landmark: ArrayLike) -> np.ndarray:
-    """Where (..., 2), in closeup pixels, a closeup shows its landmark (...) if that lies where it was thought to."""
+    """Position (..., 2) px of a closeup's landmark (...) in the closeup, if the expected position in the image is right."""
     landmark = np.asarray(landmark)
     ahead = np.array(CLOSEUP_BEHIND_PX)[landmark] * np.array(CLOSEUP_ZOOM)[landmark]
     return (size - 1) / 2 + np.stack([ahead, np.zeros_like(ahead)], -1)
 
 
 def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
-    """Points (n, 2) through a (2, 3) matrix, or point i (..., 2) through matrix i (..., 2, 3)."""
+    """Transform points (n, 2) by a matrix (2, 3), or point i (..., 2) by matrix i (..., 2, 3)."""
     return (matrix[..., :2] @ np.asarray(u, dtype=np.float64)[..., None])[..., 0] + matrix[..., 2]
 
 
 def unmapped(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
+    """Transform points u (n, 2) of windows to the image; the matrices (n, 2, 3) are window_from_image."""
     return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]
 
 
 def cut(image: np.ndarray, matrix: np.ndarray, size: int | ArrayLike, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
-    """The window (h, w, 3) uint8 of an image, of `size`, its side or (w, h); beyond the image black, or OpenCV's `border`.
+    """Cut a window (h, w, 3) uint8 of `size`, its side or (w, h), from an image; `border` (OpenCV's) fills what lies outside.
 
-    A window at less than half the image's scale is the mean over blocks of a finer one, so that nothing aliases; at less
-    than a quarter, the part of the image that it shows is halved first, which is quicker.
+    To avoid aliasing, a window at half the image's scale or less is the block mean of a finer one.  At a quarter or less, the
+    part of the image that it shows is halved first, which is faster.
     """
     finer = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8))
     side = np.broadcast_to(size, 2)

@@ -1,4 +1,4 @@
-"""Semi-dense stereo matching: DeepMatching, its fast form along epipolar lines, and alternatives (paper Sec. IV-B)."""
+"""Semi-dense stereo matching: DeepMatching, a fast version along epipolar lines, and alternatives (paper Sec. IV-B)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,24 +31,24 @@ def match(
         left, right: (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
         method: "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for `epipolar_px`.
             "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.  "sgbm", "dis": OpenCV's, on rectified
-            canvases; without a rig the pair is taken as rectified.  A callable `f(left, right, (low, high)) -> (disparity,
-            confidence)` of rectified grey uint8 images (h, w), x_right = x_left - disparity, not finite = none; confidence in
-            [0, 1]; and perhaps (h, w) bool, its own check of the way back.  None is "band" with a rig, else "deepmatching".
+            images; without a rig the pair is taken as rectified.  A callable `f(left, right, (low, high)) -> (disparity,
+            confidence)` of rectified grey uint8 images (h, w): x_right = x_left - disparity, not finite = none; confidence in
+            [0, 1]; optionally its own left-right check, (h, w) bool.  None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
-        depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a
-            point in the rig's frame, whose origin and sign they have.  None = found by a coarse pass.  Only used with a rig.
+        depth_range_mm: (near, far): the depths d.x to search, where d is the left camera's `viewing_direction` and x a point
+            in the rig's frame, so depth 0 is at that frame's origin.  None = found by a coarse pass.  Only used with a rig.
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong ones lie below), else 0.
+        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong ones are below), else 0.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
-        budget_bytes: Memory that DeepMatching may take; a search predicted to need more is refused.
-        max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.  With
+        budget_bytes: Memory that DeepMatching may use; a search that needs more, by prediction, is refused.
+        max_epipolar_px: A rig is refused if the median distance of coarse free matches to its epipolar lines is larger.  With
             ``numpy.inf`` and a `depth_range_mm` there is no coarse pass: faster, for a rig that was checked before.
-        reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).
+        reciprocal: Drop matches that fail the left-right check (mainly occlusions).
         device: torch device of free DeepMatching, such as "cuda".
 
-    Possibly none are found.  Of the three confidences the score is usually the best, but SGBM has none (always 1).  A
-    ValueError refuses unfit images, masks and options, and a rig that does not fit the images (with the epipolar error).
+    The result may have no matches.  Of score, peak ratio and reciprocity, the score is usually the best confidence; SGBM has
+    no score (always 1).  A ValueError refuses unfit images, masks and options, and a rig that does not fit the images.
 
     >>> noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     >>> matches = match(noise, np.roll(noise, 4, axis=1))

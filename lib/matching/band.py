@@ -1,6 +1,6 @@
 """Matching along the epipolar lines of a calibrated rig: rectify, find the depth range, match, refine.
 
-A coarse pass on small images, free to leave the line, tells whether the rig fits and which band of depth is searched.
+A coarse pass on small images searches beside the epipolar lines, too.  It checks the rig and finds the range of depth.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -17,50 +17,50 @@ from lib.parallel import single_threaded_torch
 
 Images = tuple[np.ndarray, np.ndarray]
 Masks = tuple[np.ndarray | None, np.ndarray | None]
-#: The setting of a search, the depth range in mm (None = found), and the largest misfit of the rig in px: see `match`.
+#: Setting, depth_range_mm (None = to be found) and max_epipolar_px of a search, as in `lib.matching.match`.
 Where = tuple[str, tuple[float, float] | None, float]
 
-#: The canvas is shrunk to so many pixels, if it has more.
+#: Largest number of pixels of the canvas (the common rectified image), for each setting.
 MAX_PIXELS = {"fast": 400_000, "quality": 3_000_000}
-#: Cells around a patch that take part in its sub-pixel step.
+#: Number of cells around a patch that its sub-pixel step uses, too.
 REFINE_MARGIN = {"fast": 0, "quality": 1}
 
-#: Binary logarithm of the pooling of the descriptors, and the width of a cell in canvas pixels.
+#: The descriptors are pooled by 2^DOWNSCALE; width of a cell in canvas pixels.
 DOWNSCALE = 1
 CELL_PX = 1 << DOWNSCALE
-#: Cells searched on either side of the epipolar line.
+#: Number of cells searched on either side of the epipolar line.
 OFF_LINE = 1
 COARSE_OFF_LINE = 5
 COARSE_WIDTH_PX = 256
 #: Half width of the coarse search, as a fraction of the canvas.
 COARSE_REACH = 0.2
-#: The coarse pass judges the rig and the depth range by this many matches or more.
+#: Least number of coarse matches for checking the rig and finding the depth range.
 MIN_SUPPORTED = 12
 
-#: Standard deviation along and off the line, in cells: gain times what `refine` says, and a floor.  Measured on
+#: Standard deviation along and off the line, in cells: gain times the one from `refine`, and a floor.  Measured on
 #: synthetic affine pairs with known surface (noise 2 grey values, unequal gain and blur): the normalised errors then
-#: have a robust standard deviation of 1 (tests hold it between 0.7 and 1.4).
+#: have a robust standard deviation of 1 (tests require 0.7 to 1.4).
 SIGMA_GAIN = 3.5
 SIGMA_FLOOR = 0.015
-#: `refine`'s sigma, in cells, at which the score is one half: there every third match of the Middlebury pairs and
-#: every twentieth of simulated eyes is wrong by more than 3/4 cell; below a third of it hardly any is.
+#: `refine`'s sigma, in cells, at which the score is one half.  At this sigma every third match of the Middlebury pairs and
+#: every twentieth of simulated eyes is wrong by more than 3/4 cell; below a third of this sigma hardly any is.
 SIGMA_HALF = 0.06
 
 CHUNK = 2048
 #: Reach of the derivative filter (8 (g1 - g-1) - (g2 - g-2)) / 12.
 REACH = 2
-#: Along an edge nothing tells where it is; this draws the step off the line to zero there.
+#: Ridge parameter of the step off the line: on an edge parallel to the line, where that step is undetermined, it becomes 0.
 RIDGE = 0.05
 
 
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
 ) -> tuple[Rectification, float, tuple[float, float], float, int]:
-    """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
+    """Choose the canvas, check the rig by coarse matches, and find the range of depth if it is not given.
 
     Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
     median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and the number of coarse
-    matches.  A ValueError refuses a rig that does not fit the images, and a depth range of which both cameras see nothing.
+    matches.  A ValueError refuses a rig that does not fit the images, and a depth range that the cameras do not share.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -75,7 +75,7 @@ def plan_search(
     if len(displacement) >= MIN_SUPPORTED:
         misfit = float(np.median(np.abs(displacement[:, 1])))
         if misfit > max_epipolar_px:
-            what = f"the median of {len(displacement)} free matches lies {misfit:.1f} px off its epipolar lines"
+            what = f"the median distance of {len(displacement)} free matches from their epipolar lines is {misfit:.1f} px"
             cure = "Calibrate again, or check that left and right are not exchanged"
             allowed = f"{max_epipolar_px:.1f} px are allowed (max_epipolar_px)"
             raise ValueError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
@@ -89,24 +89,24 @@ def plan_search(
 
 
 def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:
-    """Displacements (n, 2) along and off the line, in pixels of the canvas `whole`, of small images matched in a wide
-    window; only of matches with support.  And the number of matches with and without.
+    """Displacements (n, 2) along and off the line, in pixels of the canvas `whole`, from small images matched in a wide
+    window, of the matches that agree with their neighbours.  Also the number of all matches.
     """
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
     matches = _match(left, right, -reach, COARSE_OFF_LINE)[0]  # the volume is large
-    # Those that three neighbours on the lattice or more support: they moved alike, within 1.5 cells.
+    # Keep matches with at least three neighbours on the lattice whose displacement is the same within 1.5 cells.
     gx, gy = matches.patch.max(axis=0, initial=0) + 1
     field, (x, y) = np.full((gy + 2, gx + 2, 2), np.nan), matches.patch.T + 1
     field[y, x] = matches.displacement
     apart = np.array([field[y + dy - 1, x + dx - 1] - matches.displacement for dy, dx in np.ndindex(3, 3)])
-    chosen = matches.keep((np.abs(apart).max(axis=2, initial=0) <= 1.5).sum(axis=0) > 3)  # each match supports itself
+    chosen = matches.keep((np.abs(apart).max(axis=2, initial=0) <= 1.5).sum(axis=0) > 3)  # each match counts itself
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
     displacement = (chosen.cell + step) * CELL_PX / scale
-    # Both canvases refer to the same depth only up to whole coarse pixels.
+    # The reference depths of the two canvases differ because each is rounded to whole pixels of its own canvas.
     displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
     return displacement, len(matches.patch)
 
@@ -134,7 +134,7 @@ def _descriptors(
 def _match(
     left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True
 ) -> tuple[VolumeMatches, torch.Tensor]:
-    """Matches of two grids, without those on flat or mostly masked patches or without a peak, and the volume."""
+    """Matches of two grids, except those on flat or mostly masked patches or without a peak; and the correlation volume."""
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), off_line)
         matches = match_volume(volume, low, reciprocal=reciprocal)
@@ -153,7 +153,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
         return Matches(u, u, none, np.zeros((0, 4, 4)), peak_ratio=none, reciprocal=none.astype(bool), method="band")
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
-    need = 4 * gy * gx * (2 * OFF_LINE + 1) * (high - low + 1) * 2.7  # bytes: the volume as float32, and its pooled copies
+    need = 4 * gy * gx * (2 * OFF_LINE + 1) * (high - low + 1) * 2.7  # bytes of the float32 volume and its pooled copies
     if need > budget_bytes:
         what = f"{high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB"
         budget = f"the budget is {budget_bytes / 2**30:.2f} GiB"
@@ -165,7 +165,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     ratio = peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
     del volume  # large
 
-    # The match lies on the line, at the best whole cell, and one step of `refine` from there.
+    # Start on the line at the best whole cell, and add one step of `refine`.
     start = found.patch * PATCH
     on_line = start + np.column_stack([found.cell[:, 0] - low, np.full(len(start), OFF_LINE)])
     step, sigma = refine(left, right, start, on_line, margin=REFINE_MARGIN[where[0]])
@@ -185,7 +185,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
 
 
 def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndarray:
-    """(n, s + 2, s + 4, C) windows of a grid (h, w, C) whose patches start at (x, y), with their margins."""
+    """(n, s + 2, s + 4, C) windows of a grid (h, w, C): the patches that start at (x, y), with margins; s = 4 + 2 margin."""
     side = PATCH + 2 * margin
     height, width, channels = grid.shape
     window = side + 2, (side + 2 * REACH) * channels
@@ -194,7 +194,7 @@ def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndar
 
 
 def _derivatives(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Along x, to fourth order, and along y, (n, s, s, C)."""
+    """Derivatives along x, of fourth order, and along y, (n, s, s, C)."""
     middle = windows[:, 1:-1]
     near, far = middle[:, :, 3:-1] - middle[:, :, 1:-3], middle[:, :, 4:] - middle[:, :, :-4]
     across = windows[:, 2:, REACH:-REACH] - windows[:, :-2, REACH:-REACH]
@@ -207,15 +207,15 @@ def refine(
     """Refine matches of whole cells by one symmetric Gauss-Newton step on the descriptors.
 
     With f the left and g the right patch, scaled to the same norm, and w the mean of their gradients along x, the step is
-    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004), which has no bias at zero.
+    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004), which is unbiased at zero.
 
     Args:
         left, right: (h, w, C) float32 descriptor grids.
         start_left, start_right: (n, 2) int, (x, y) cells where the matching 4 x 4 patches start.
-        margin: Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
+        margin: Number of cells added to the patch on every side: less noise on smooth surfaces, worse at depth edges.
 
-    Returns cells (n, 2) to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave it
-    finds it; and their standard deviations (n, 2) if the descriptors' residuals were independent, up to a scale.
+    Returns the steps (n, 2) to add to the right cells, within -1 and 1: x is the step along the line alone, y belongs to a
+    step in both directions.  Also their standard deviations (n, 2), up to a scale, for independent descriptor residuals.
     """
     pad = margin + REACH
     left, right = (np.pad(grid, ((margin + 1, margin + 1), (pad, pad), (0, 0))) for grid in (left, right))
@@ -228,7 +228,7 @@ def refine(
         slopes = [[a.reshape(len(f), -1) for a in _derivatives(windows)] for windows in (f, g)]
         f, g = (np.ascontiguousarray(a[:, 1:-1, REACH:-REACH]).reshape(len(a), -1) for a in (f, g))
         scale = np.sqrt(np.einsum("ij,ij->i", f, f) / np.maximum(np.einsum("ij,ij->i", g, g), 1e-12))[:, None]
-        w, across = ((mine + other * scale) * np.float32(0.5) for mine, other in zip(*slopes, strict=True))
+        w, across = ((f_slope + g_slope * scale) * np.float32(0.5) for f_slope, g_slope in zip(*slopes, strict=True))
         f -= g * scale
         information = np.maximum(np.einsum("ij,ij->i", w, w), 1e-12)
         projection = np.einsum("ij,ij->i", w, f)

@@ -1,4 +1,4 @@
-"""DeepMatching: the pyramid of responses, on displacements along the epipolar line or free, on the CPU or on CUDA.
+"""DeepMatching: a pyramid of responses, along the epipolar line or over the whole image, on the CPU or on CUDA.
 
 Source: Revaud, Weinzaepfel, Harchaoui, Schmid, DeepMatching: Hierarchical Deformable Dense Matching (IJCV 2016).
 
@@ -6,12 +6,12 @@ Source: Revaud, Weinzaepfel, Harchaoui, Schmid, DeepMatching: Hierarchical Defor
 2. Bottom-up: the response of a patch twice as large is the mean of its four children's responses, each max-pooled
    (so that a child may move by a cell) and halved; then raised to the power 1.4.
 3. Top-down: from every cell of every top map the best children are followed down and their responses added up.  Each
-   cell keeps its best path only.  This is a max-sum dynamic programme, so it runs on whole maps at once.
-4. A match is kept if it is the best of its left patch and of its place in the right image.
+   cell keeps only its best path.  This is a max-sum dynamic programme, so it runs on whole maps at once.
+4. A match is kept if it is the best one of its left patch and of its position in the right image.
 
-Parents live on a dense lattice whose step is the atomic patch, so every level has about as many maps as the first.  The
-last two axes are either places in the right image (`shifted`: a child lies one pooled cell away from its parent) or
-displacements, in which a child stays where its parent is, so that both passes are slices only.
+The patches of a level form a dense lattice whose step is the atomic patch, so every level has about as many maps as the
+first.  The last two axes of the responses are either positions in the right image (`shifted`: a child is one pooled cell
+away from its parent) or displacements, where child and parent have the same index, so that both passes use only slices.
 """
 
 from collections.abc import Iterator
@@ -27,9 +27,9 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 
 POWER = 1.4
 BORDER_POWER = 0.9
-#: Lattice rows of a volume that are worked on at once: they stay in the cache.
+#: Number of lattice rows that are processed at once: they stay in the cache.
 ROWS = 8
-#: Bytes of the full maps of atomic patches that are held at once.
+#: Memory for the full maps of atomic patches that are processed at once, bytes.
 CHUNK_BYTES = 32 << 20
 
 
@@ -41,7 +41,7 @@ def unit_patches(grid: torch.Tensor) -> torch.Tensor:
 
 
 def n_levels(gy: int, gx: int) -> int:
-    """Levels above the atomic patches: patches double while they fit the longer side and all their children exist."""
+    """Number of levels above the atomic patches: sizes double while they fit the longer side and all children exist."""
     levels = 0
     while 2 ** (levels + 1) <= max(gy, gx) and 2 ** max(levels - 1, 0) <= min(gy, gx) / 2:
         levels += 1
@@ -51,27 +51,27 @@ def n_levels(gy: int, gx: int) -> int:
 def pool(maps: torch.Tensor, start: int = 0) -> torch.Tensor:
     """Maxima over 3 x 3 cells, at every second column and at the rows start (0 or 1), start + 2, ..."""
     pooled, beside = maps[:, :, start : maps.shape[2] - start : 2].clone(), maps[:, :, 1 - start :: 2]
-    for before, after in ((0, start), (1 - start, 0)):  # whole rows are far quicker than max_pool2d
+    for before, after in ((0, start), (1 - start, 0)):  # whole rows are much faster than max_pool2d
         rows = beside[:, :, after : after + pooled.shape[2] - before]
         torch.maximum(into := pooled[:, :, before : before + rows.shape[2]], rows, out=into)
     return max_pool1d(pooled.flatten(0, 2), 3, stride=2, padding=1).reshape(*pooled.shape[:3], -1)
 
 
 def unpool(maps: torch.Tensor, score: torch.Tensor, start: int = 0) -> torch.Tensor:
-    """Give the score of each pooled cell to the cell that was its maximum in `pool`; cells that none reaches get -inf."""
+    """Give the score of each pooled cell to the cell that was its maximum in `pool`; all other cells get -inf."""
     highest = max_pool2d(maps, 3, stride=2, padding=(1 - start, 1), return_indices=True)[1]
     out = torch.full_like(maps, -torch.inf).flatten(2)
     return out.scatter_reduce_(2, highest.flatten(2), score.flatten(2), "amax").view(maps.shape)
 
 
 def _by_axis(maps: torch.Tensor, axis: int) -> torch.Tensor:
-    """The same responses with the lattice and the map along one axis first."""
+    """The responses with the lattice dimension and the map dimension of one axis first."""
     return maps.movedim((axis, axis + 2), (0, 1))
 
 
 def _sides(level: int, n: int, n_map: int, shifted: bool) -> Iterator[tuple[tuple, tuple]]:
-    """Indices (lattice, map) of parents and children, for the child before and the child behind, of n children."""
-    wider = int(level == 1)  # there is a parent beyond the last child
+    """Indices (lattice, map) of parents and of their n children along an axis: first the child before, then the one after."""
+    wider = int(level == 1)  # level 1 has one parent more than children
     off = 1 if level == 1 else 2 ** (level - 2)
     near, far = slice(0, n_map - shifted), slice(int(shifted), n_map)
     yield (slice(off, n + wider), far), (slice(0, n + wider - off), near)
@@ -81,8 +81,8 @@ def _sides(level: int, n: int, n_map: int, shifted: bool) -> Iterator[tuple[tupl
 def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> torch.Tensor:
     """Responses of the parents of a level along one lattice axis: the mean of the children that exist.
 
-    Children beyond the lattice do not exist; of those that do, some have a place beyond the map (not valid).  The sum
-    over the valid ones is divided by n_exist^0.1 n_valid^0.9, as in the published implementation.
+    Children beyond the lattice do not exist.  An existing child is valid if its position is inside the map.  The sum over the
+    valid ones is divided by n_exist^0.1 n_valid^0.9, as in the published implementation.
     """
     shape = list(pooled.shape)
     shape[axis] += level == 1
@@ -110,15 +110,15 @@ def _scatter(score: torch.Tensor, axis: int, level: int, n: int, *, shifted: boo
 
 
 def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int = 1) -> torch.Tensor:
-    """Score of the best path through the pyramid to every pooled cell of the patches below a level; -inf where none leads.
+    """Score of the best path from the top to every pooled cell of the patches below `level`; -inf if there is no path.
 
-    `pooled` are the responses after the power, those of the atomic patches at the first of at most `levels`.
+    `pooled` are the pooled responses of these patches after the power; at level 1 these are the atomic patches.
     """
     if level > levels:
         return pooled
     score = gather(gather(pooled, 0, level, shifted=shifted), 1, level, shifted=shifted).pow_(POWER)
     if level < levels and score.shape[2:].numel() > 1:
-        # Of displacements the epipolar line itself, the middle row, is always one that is sampled.
+        # With displacements, the sampled rows include the middle one, which is the epipolar line.
         start = 0 if shifted else (score.shape[2] // 2) % 2
         score = unpool(score, path_scores(pool(score, start), levels, shifted=shifted, level=level + 1), start)
     for axis in (0, 1):
@@ -127,10 +127,10 @@ def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int 
 
 
 def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> np.ndarray:
-    """Response (m,) around each match over the largest one elsewhere in its map (Hu and Mordohai, PAMI 2012).
+    """Response (m,) at each match divided by the largest one elsewhere in its map (Hu and Mordohai, PAMI 2012).
 
-    Infinite where nothing else responds, NaN where there is no place for a rival.  The maps (m, rows, columns), 0 where
-    nothing is seen, are overwritten; the match lies at `row`, `column` (m,) int, and the cells next to it count as it.
+    The match is at `row`, `column` (m,) int and includes the cells next to it.  The ratio is infinite if the responses
+    elsewhere are 0, NaN if there are no other cells.  The maps (m, rows, columns), 0 where masked, are overwritten.
     """
     step = torch.arange(-1, 2, device=maps.device)
     rows = (row[:, None, None] + step[:, None]).clamp(0, maps.shape[1] - 1)
@@ -147,9 +147,9 @@ class VolumeMatches(NamedTuple):
 
     patch: np.ndarray  # (n, 2) int, (gx, gy) of the 4 x 4 cell patch
     cell: np.ndarray  # (n, 2) int, (dx, dy) displacement in whole cells
-    displacement: np.ndarray  # (n, 2), the same at the vertex of a parabola through the response and its neighbours
-    peaked: np.ndarray  # (n,) bool, whether the response has an interior peak along x
-    reciprocal: np.ndarray  # (n,) bool, whether no other patch fits the same place of the right image better
+    displacement: np.ndarray  # (n, 2), sub-cell: at the vertex of a parabola through the response and its neighbours
+    peaked: np.ndarray  # (n,) bool, True if the response has an interior peak along x
+    reciprocal: np.ndarray  # (n,) bool, True if no other patch fits the same position in the right image better
 
     def keep(self, chosen: np.ndarray) -> Self:
         """The matches of a mask (n,) or of indices."""
@@ -157,7 +157,7 @@ class VolumeMatches(NamedTuple):
 
 
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
-    """Cosines (gy, gx, 2 v + 1, n) of every 4 x 4 patch of the left grid with its displaced windows in the right one.
+    """Cosine similarities (gy, gx, 2 v + 1, n) of the 4 x 4 patches of the left grid and displaced windows of the right.
 
     The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side.
     """
@@ -176,7 +176,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
     column = (PATCH * ROWS + 2 * v) * row
 
     def correlate(top: int) -> None:
-        """Fill one chunk of lattice rows, from windows laid out as (x, y, 4 cells of the row): any is then contiguous."""
+        """Fill one chunk of lattice rows.  `strip` has the layout (x, y, 4 cells of the row), so windows are contiguous."""
         k = min(ROWS, gy - top)
         rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
         strip = right.new_empty(n_x, column // row, row)
@@ -200,21 +200,21 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
 def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> VolumeMatches:
     """The best displacement of each patch: bottom-up, top-down, reciprocal check, sub-cell peak.
 
-    `low` is the volume's first displacement along x, cells; without `reciprocal` that check drops nothing.
+    `low` is the volume's first displacement along x in cells; without `reciprocal`, failed checks are only marked.
     """
     gy, gx, rows, n = volume.shape
     v = rows // 2
-    # The power is monotone, so it may follow the maximum, which is a quarter of the work.
+    # The power is monotone, so it can be applied after pooling, with a quarter of the work.
     scores = path_scores(pool(volume, v % 2) ** POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
 
-    # The displaced centre of a patch falls into the bin (4 g + 2 + d) // 4: displacements in fours share one.
+    # Bins of the right image, 4 cells wide: the displaced centre of patch g is in bin (4 g + 2 + d) // 4.
     bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
-    in_x, in_y = ([np.flatnonzero(of == i) for i in range(of[0], of[-1] + 1)] for of in (bin_x, bin_y))
+    in_x, in_y = ([np.flatnonzero(index == i) for i in range(index[0], index[-1] + 1)] for index in (bin_x, bin_y))
     bins = volume.new_full((gy + len(in_y) - 1, gx + len(in_x) - 1), -torch.inf)
     best, flat = volume.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long)
 
     def search(top: int) -> list[list[torch.Tensor]]:
-        """Best displacements of a chunk of lattice rows; its strongest scores per bin, (chunk, gx) for each (y, x)."""
+        """Find the best displacements of a chunk of lattice rows; returns the largest scores (chunk, gx) for each bin."""
         part = slice(top, min(top + ROWS, gy))
         score = unpool(volume[part], scores[part], v % 2)
         torch.max(score.flatten(2), dim=2, out=(best[part], flat[part]))
@@ -229,8 +229,8 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
                     torch.maximum(there, chunk, out=there)
     y, x = torch.meshgrid(torch.arange(gy), torch.arange(gx), indexing="ij")
     j, k = flat // n, flat % n
-    own_y, own_x = (torch.from_numpy(of - of[0])[at] + grid for of, at, grid in ((bin_y, j, y), (bin_x, k, x)))
-    passed = best >= bins[own_y, own_x]
+    own = (torch.from_numpy(bin_y - bin_y[0])[j] + y, torch.from_numpy(bin_x - bin_x[0])[k] + x)
+    passed = best >= bins[own]
     kept = torch.isfinite(best) & (passed | (not reciprocal))
 
     place = y[kept], x[kept], j[kept], k[kept]
@@ -242,7 +242,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
 
 
 def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Vertex (in [-0.5, 0.5]) of the response around its peak along one axis, 0 where it has no interior peak; has it?"""
+    """Vertex (-0.5 to 0.5, relative to the peak) of the response along one axis, or 0; and if there is an interior peak."""
     n, index = volume.shape[axis], place[axis]
     beside = ([(index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place)] for step in (-1, 0, 1))
     before, centre, after = (volume[tuple(at)] for at in beside)
@@ -252,7 +252,7 @@ def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) 
 
 
 def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *, downscale: int = 1) -> int:
-    """Peak memory in bytes of free DeepMatching of two images (h, w)."""
+    """Predicted peak memory in bytes of free DeepMatching of two images (h, w)."""
     (gy, gx), (n_y, n_x) = ([n >> downscale for n in shape[:2]] for shape in (shape_left, shape_right))
     gy, gx, n_y, n_x = gy // PATCH, gx // PATCH, n_y + 1, n_x + 1
     windows = n_y * n_x * PATCH**2 * CHANNELS
@@ -267,15 +267,15 @@ def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *
 
 
 def unit_windows(grid: torch.Tensor) -> torch.Tensor:
-    """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner, zero outside the grid."""
+    """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner; cells outside the grid are zero."""
     windows = pad(grid, (0, 0, *[PATCH // 2] * 4)).unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
     return windows.div_(windows.norm(dim=2, keepdim=True).clamp_min(1e-12))
 
 
 def correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
-    """Cosines (ry, rx, n_y, n_x) of atomic patches (ry, rx, 16 C) and windows (n_y, n_x, 16 C).
+    """Cosine similarities (ry, rx, n_y, n_x) of atomic patches (ry, rx, 16 C) and windows (n_y, n_x, 16 C).
 
-    At the border only the part of the patch that falls inside the image counts.
+    At the border only the part of the patch that is inside the image is used.
     """
     n_y, n_x, _ = windows.shape
     maps = torch.tensordot(patches, windows, ([2], [2]))
@@ -290,7 +290,7 @@ def correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tens
 
 
 def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, np.ndarray, torch.Tensor]:
-    """Of each patch (gy, gx): best corner (x, y), score, peak ratio, and whether no other patch fits its place better."""
+    """For each patch (gy, gx): best corner (x, y), score, peak ratio, and True if no other patch fits there better."""
     patches, windows = unit_patches(left), unit_windows(right)
     (gy, gx), (n_y, n_x) = patches.shape[:2], windows.shape[:2]
 
@@ -303,7 +303,7 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
     pooled = patches.new_empty(gy, gx, (n_y + 1) // 2, (n_x + 1) // 2)
     for part, maps in chunks():
         pooled[part] = pool(maps)
-    # The power is monotone, so it may follow the maximum, which is a quarter of the work.
+    # The power is monotone, so it can be applied after pooling, with a quarter of the work.
     score = path_scores(pooled.pow_(POWER), n_levels(gy, gx), shifted=True)
     best, place = score.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=score.device)
     ratio, strongest = np.empty((gy, gx)), score.new_full((n_y * n_x,), -torch.inf)
@@ -340,7 +340,7 @@ def match_free(
     left, right = (pixel_descriptors(image, fitting[0], valid=seen) for image, seen in zip(images, valid, strict=True))
     try:
         grids = [torch.from_numpy(grid).to(device) for grid in (left, right)]
-    except (RuntimeError, AssertionError) as error:  # unknown, absent, or not what this torch was built for
+    except (RuntimeError, AssertionError) as error:  # unknown or absent device, or torch was built without it
         raise ValueError(f"device: {device!r} cannot be used: {error}") from None
     corner, best, ratio, passed = _match_grids(*grids)
     corner, best, passed = (array.cpu().numpy() for array in (corner, best.double(), passed))
@@ -348,10 +348,10 @@ def match_free(
     kept = np.isfinite(best) & patch_quality(left) & (right[target[..., 1], target[..., 0], CHANNELS - 1] > 0)
     kept &= passed | (not reciprocal)
     y, x = np.nonzero(kept)
-    # A corner c of the grid lies at c * stride - 1/2 px where pixel centres are integers.
+    # Pixel centres are integers, so the corner c of the grid is at c * stride - 1/2 px.
     u_left = (np.column_stack([x, y]) * PATCH + PATCH // 2) * float(stride) - 0.5
     u_right = corner[kept] * float(stride) - 0.5
-    # Positions are multiples of the stride: a uniform error, beside what the descriptor itself cannot tell.
+    # Positions are multiples of the stride, which gives a uniform error; the second term is the descriptor's own error.
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [variance] * 2), (len(u_left), 1, 1))
     score = np.clip(best[kept] / (n_levels(*best.shape) + 1), 0, 1)

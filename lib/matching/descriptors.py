@@ -7,27 +7,27 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Cells along a side of DeepMatching's atomic patches.
+#: Number of cells along a side of DeepMatching's atomic patches.
 PATCH = 4
-#: Eight orientations and one constant, which keeps flat patches from matching noise.
+#: Eight orientations, and a constant that keeps flat patches from matching noise.
 CHANNELS = 9
 
 SIGMA_PX = 1.0
 SLOPE = 0.2
 CONSTANT = 0.3
-#: How far a descriptor looks: three blurs of 3 px and a gradient of 1 px.
+#: Distance at which pixels influence a descriptor: three blurs of 3 px and a gradient of 1 px.
 REACH_PX = 10
 STRIP_PIXELS = 1 << 17
 #: Mean squared length of the orientation channels below which a patch is flat: gradients well below 1 grey value.
 MIN_TEXTURE = 1e-4
-#: Least part of a patch that must not be masked.
+#: Smallest share of a patch that is not masked.
 MIN_SEEN = 0.5
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
-    """A grey uint8 image (h, w) of an RGB (h, w, 3) or grey (h, w) uint8 image of 16 x 16 px or more.
+    """A grey uint8 image (h, w) from an RGB (h, w, 3) or grey (h, w) uint8 image of at least 16 x 16 px.
 
-    A ValueError of anything else names the argument `name`.
+    A ValueError refuses anything else and names the argument `name`.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8:
@@ -46,14 +46,14 @@ def _blur(image: np.ndarray) -> np.ndarray:
 def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray | None = None) -> np.ndarray:
     """Descriptors (h >> downscale, w >> downscale, 9) float32 of a grey image (h, w), float32 or uint8, 0..255.
 
-    The image is smoothed, its gradient projected on eight directions and rectified, smoothed, squashed by
-    2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little), smoothed again; a constant ninth channel ends it.  Then
-    cells of 2^downscale px are averaged.  Those with any pixel that is not `valid` (h, w) are zero, and so say nothing.
+    The image is smoothed.  Its gradient is projected on eight directions, its negative part set to zero, smoothed,
+    compressed by 2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little) and smoothed again.  The ninth channel is
+    constant.  Cells of 2^downscale px are averaged.  Cells with a pixel that is not `valid` (h, w) are zero, thus ignored.
     """
     stride = 1 << downscale
     rows, columns = gray.shape[0] // stride, gray.shape[1] // stride
     descriptors = np.empty((rows, columns, CHANNELS), np.float32)
-    # Strips that stay in the cache, with the rows around them that the three blurs and the gradient reach.
+    # Work on strips that stay in the cache, with a margin of rows for the three blurs and the gradient.
     strip = max(1, STRIP_PIXELS // (gray.shape[1] * stride))
     for first in range(0, rows, strip):
         last = min(first + strip, rows)
@@ -67,7 +67,7 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
 
 
 def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> None:
-    """Fill `out` (rows / stride, w / stride, 9) with the descriptors of some rows of a strip."""
+    """Fill `out` (rows / stride, w / stride, 9) with the descriptors of the given rows of a strip."""
     smooth = _blur(gray.astype(np.float32, copy=False))
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, borderType=cv2.BORDER_REPLICATE)
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, borderType=cv2.BORDER_REPLICATE)
@@ -84,7 +84,7 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
 
 
 def patch_quality(grid: np.ndarray) -> np.ndarray:
-    """Mask (gy, gx) of the patches that have texture and are mostly not masked, of descriptors (h, w, 9)."""
+    """(gy, gx) bool: True for the patches of descriptors (h, w, 9) that have texture and are mostly not masked."""
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
     cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
     constant = np.ascontiguousarray(cells[..., CHANNELS - 1])

@@ -1,4 +1,4 @@
-"""Masks of what a matcher should ignore: (h, w) bool, True = ignore."""
+"""Masks of pixels that a matcher should ignore: (h, w) bool, True = ignore."""
 
 import cv2
 import numpy as np
@@ -6,14 +6,14 @@ from numpy.typing import ArrayLike
 
 
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
-    """Specular reflections: pixels whose every channel is nearly saturated (245), grown by a margin for the halo.
+    """Specular reflections: pixels with all channels nearly saturated (245 or more), dilated by a margin for the halo.
 
-    A glint moves with the viewpoint, so a match on one has a mirror image's depth.  `image` is uint8, (h, w, 3) or (h, w).
+    A glint moves with the viewpoint, so a match on it has a mirror image's depth.  `image` is uint8, (h, w, 3) or (h, w).
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
-    core = cv2.inRange(np.ascontiguousarray(image), (245,) * 4, (255,) * 4)  # OpenCV takes as many as there are channels
+    core = cv2.inRange(np.ascontiguousarray(image), (245,) * 4, (255,) * 4)  # OpenCV uses one for each channel
     return cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2)).astype(bool)
 
 
@@ -22,8 +22,8 @@ def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float
 
     Args:
         shape: (h, w) of the image.
-        u_landmarks: (3, 2) px of base, tip_1, tip_2.  A jaw whose tip is NaN is left out; without base or jaws all is.
-        width_px: Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
+        u_landmarks: (3, 2) px of base, tip_1, tip_2.  A jaw with a NaN tip is left out; without base or tips, all is.
+        width_px: Full width of jaws and shaft, with a margin; None is 0.45 of the mean jaw length.
     """
     u = np.asarray(u_landmarks, dtype=np.float64)
     if u.shape != (3, 2):
@@ -44,7 +44,7 @@ def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float
 
 
 def checked_mask(mask: ArrayLike, shape: tuple[int, int], name: str) -> np.ndarray:
-    """The mask as an array; a ValueError that names the argument `name` if it is not bool of this shape or leaves nothing."""
+    """The mask as an array.  A ValueError names the argument `name` if it is not bool of this shape, or masks everything."""
     mask = np.asarray(mask)
     if mask.shape != shape or mask.dtype != bool:
         raise ValueError(f"{name}: expected a bool array {shape}, True = ignore, got {mask.dtype} {mask.shape}.")

@@ -1,4 +1,4 @@
-"""Other matchers under the same interface: OpenCV's SGBM and DIS, and any callable, on rectified canvases."""
+"""Other matchers with the same interface: OpenCV's SGBM and DIS, and any callable, on rectified images."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,17 +15,17 @@ from lib.matching.rectification import on_image, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
 
-#: Matches are taken on this lattice, as DeepMatching's are at full resolution.
+#: Disparities are sampled on a lattice of this step, which is DeepMatching's at full resolution.
 LATTICE_PX = PATCH * CELL_PX
-#: Standard deviation of a disparity in canvas px (1.48 times the median error, between that on simulated eyes and on
-#: Middlebury pairs); for callables too.  It is the same everywhere, since these matchers state no uncertainty.
+#: Standard deviation of a disparity in canvas px, also for callables: these matchers state none, so it is constant.  It is
+#: 1.48 times the median error, a value between those on simulated eyes and on Middlebury pairs.
 SIGMA_PX = 0.2
 
 
 def _sgbm(left: np.ndarray, right: np.ndarray, range_px: tuple, *, checked: bool) -> tuple[np.ndarray, ...]:
-    """Semi-global block matching (Hirschmueller, PAMI 2008), HH mode; states no confidence.
+    """Semi-global block matching (Hirschmueller, PAMI 2008), HH mode; it has no confidence.
 
-    `checked` leaves out what fails the left-right check; else a second run says which these are.
+    `checked` drops disparities that fail the left-right check; else a second run only marks them.
     """
     low, block = int(np.floor(range_px[0])), 5
 
@@ -38,15 +38,15 @@ def _sgbm(left: np.ndarray, right: np.ndarray, range_px: tuple, *, checked: bool
         found = sgbm.compute(left, right).astype(np.float32) / 16
         return np.where(found < low, np.nan, found)
 
-    # OpenCV takes -1, no check, for 1; so the image's width stands for no check.
+    # OpenCV treats -1 (no check) like 1, so a tolerance of the image's width turns the check off.
     found = disparity(1 if checked else left.shape[1])
     return found, np.isfinite(found).astype(float), np.isfinite(found if checked else disparity(1))
 
 
 def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple) -> tuple[np.ndarray, ...]:
-    """Dense inverse search (Kroeger et al., ECCV 2016), forward and backward; confidence from their difference."""
+    """Dense inverse search (Kroeger et al., ECCV 2016), forward and backward; the confidence is 1 - their difference."""
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    # DIS sees only small motion well: start it at the middle of the range.
+    # DIS only finds small displacements well: start it at the middle of the range.
     start = np.zeros((*left.shape, 2), np.float32)
     start[..., 0] = -sum(range_px) / 2
     forward, backward = dis.calc(left, right, start.copy()), dis.calc(right, left, -start)
@@ -59,7 +59,7 @@ def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple) -> tuple[np.ndarr
 def match_with(
     function: Callable | str, images: Images, masks: Masks, rig: StereoRig, where: Where, *, reciprocal: bool
 ) -> Matches:
-    """Rectify by the rig, call a disparity function, and sample its result on a lattice.
+    """Rectify the images by the rig, call a disparity function, and sample its result on a lattice.
 
     Arguments as in `lib.matching.match`, images (h, w) uint8 grey.
     """
@@ -68,7 +68,7 @@ def match_with(
     name = function if named else getattr(function, "__name__", "callable")
     rectification, scale, (low, high), *_ = plan_search(images, masks, rig, where)
 
-    # Matchers only find what lies in both images, so the canvas is widened by the reach of the search.
+    # Matchers only find points inside both canvases, so widen the canvas by the largest displacement.
     width, height = rectification.size_px
     reach = min(int(np.ceil(max(abs(low), abs(high)))), int(COARSE_REACH * 2 * width))
     reach = -(-reach // LATTICE_PX) * LATTICE_PX
@@ -105,10 +105,10 @@ def match_with(
 def _judge(
     images: Images, valid: Images, reach: int, range_px: tuple[float, float], points: np.ndarray, displacement: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Peak ratio (n,) of DeepMatching's descriptors at displacements (n,) of lattice points (n, 2), since these matchers
-    state none.  And which points (n,) have texture: on a flat patch a smooth disparity is made up from its neighbours.
+    """Peak ratios (n,) of lattice points (n, 2) at displacements (n,), from DeepMatching's descriptors, since these matchers
+    give none; and (n,) bool, True for points with texture: on flat patches a disparity is interpolated from neighbours.
 
-    `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
+    `reach`, a multiple of the lattice's step, is the width of the margin that the canvases have on either side.
     """
     pairs = zip(images, valid, strict=True)
     left, right = (pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in pairs)

@@ -1,8 +1,8 @@
-"""Affine rectification: two 2-D affine maps that make the epipolar lines of a rig the rows of one canvas.
+"""Affine rectification: two 2-D affine maps that make the epipolar lines of a rig the rows of a common image, the canvas.
 
-For an affine rig a point seen at u_left lies at u_right = H (u_left - t_l) + t_r + z e, where z = d.x is its depth
-along the left viewing direction d, H = A_r pinv(A_l) and e = A_r d.  So the right image warped by H looks like the
-left one up to a shift along H^-1 e that is linear in depth, as long as the two viewing directions differ.
+For an affine rig a point at u_left is imaged at u_right = H (u_left - t_l) + t_r + z e, where z = d.x is its depth along
+the left viewing direction d, H = A_r pinv(A_l) and e = A_r d.  So the right image warped by H equals the left one up to a
+shift along H^-1 e that is linear in depth, if the two viewing directions differ.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ RECTIFIED = StereoRig(AffineCamera([[1, 0, 0, 0], [0, 1, 0, 0]]), AffineCamera([
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """A canvas that covers the left image and on which both images share their rows."""
+    """A canvas that covers the left image.  A point has the same canvas row in both images."""
 
-    left_from_canvas: np.ndarray  # (2, 3) maps from canvas to image pixels
-    right_from_canvas: np.ndarray  # the same at `reference_depth_mm`
+    left_from_canvas: np.ndarray  # (2, 3) affine map from canvas to image pixels
+    right_from_canvas: np.ndarray  # the same for the right image, for points at `reference_depth_mm`
     size_px: tuple[int, int]  # (width, height) of the canvas
-    displacement_px_per_mm: float  # a point dz deeper than the reference lies this times dz further along +x on the right
+    displacement_px_per_mm: float  # shift along the canvas's +x in the right image, for each mm beyond the reference
     reference_depth_mm: float  # depth d.x along the left viewing direction d at which the displacement is 0
 
     def depth_range_mm(self, displacement_range_px: tuple[float, float]) -> tuple[float, float]:
@@ -33,9 +33,9 @@ class Rectification:
         return float(ends.min()), float(ends.max())
 
     def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
-        """(low, high) displacements of a range of depth, as far as both cameras can see it in a right image (h, w).
+        """(low, high) displacements of a range of depth, limited to the part that both cameras see; `shape_right` is (h, w).
 
-        A ValueError where they see nothing of it says what depths they see.
+        If they see nothing of it, a ValueError states the depths that they see.
         """
         low, high = np.sort(np.subtract(depth_range_mm, self.reference_depth_mm) * self.displacement_px_per_mm).tolist()
         corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
@@ -49,14 +49,14 @@ class Rectification:
 
 
 def on_image(image_from_canvas: np.ndarray, canvas: np.ndarray) -> np.ndarray:
-    """Image pixels (n, 2) of canvas points (n, 2), which are displaced for the right image."""
+    """Image pixels (n, 2) of canvas points (n, 2); for the right image, add the displacement to the points first."""
     return canvas @ image_from_canvas[:, :2].T + image_from_canvas[:, 2]
 
 
 def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1) -> Rectification:
     """The rectification of a rig for images of these shapes (h, w), with `scale` canvas pixels per left pixel.
 
-    Of near-affine cameras it is that of the affine ones which touch them.  A ValueError refuses two that look the same way.
+    For near-affine cameras it uses their affine matrices.  A ValueError refuses cameras with the same viewing direction.
     """
     A_l, A_r = rig.left.linear, rig.right.linear
     H = A_r @ np.linalg.pinv(A_l)
@@ -74,7 +74,7 @@ def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int,
     at_zero = H @ (left[:, 2] - rig.left.offset_px) + rig.right.offset_px
     right_linear = H @ left[:, :2]
 
-    # The depth that brings the image centres together, but for whole pixels: a rectified pair is not resampled.
+    # At the reference depth the image centres coincide, up to whole pixels, so that a rectified pair is not resampled.
     displacement = float(scale * direction @ shift)
     gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ ((np.array(size) - 1) / 2) + at_zero)
     whole = np.rint(np.linalg.solve(right_linear, gap)[0])
@@ -86,16 +86,16 @@ def warp(
     gray: np.ndarray, image_from_canvas: np.ndarray, size_px: tuple[int, int], *, shift_px: tuple[float, float] = (0, 0),
     mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """An image (h, w), float32 or uint8, on a canvas by `image_from_canvas` (2, 3); anti-aliased where that is coarser.
+    """Resample an image (h, w), float32 or uint8, on a canvas by `image_from_canvas` (2, 3), anti-aliased if that is coarser.
 
-    The part of the canvas has `size_px` (width, height) from pixel `shift_px`; `mask` (h, w) bool is True = ignore.  Gives
-    (height, width) float32, borders continued; and bool, False outside the image and where masked.
+    The result covers `size_px` (width, height) of the canvas from pixel `shift_px` on; `mask` (h, w) bool is True = ignore.
+    Returns (height, width) float32, with the border pixels continued; and bool, False outside the image and where masked.
     """
     linear = image_from_canvas[:, :2]
     offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)
     seen = np.full(gray.shape, 255, np.uint8) if mask is None else (~mask).view(np.uint8) * np.uint8(255)
     factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
-    if factor > 1:  # the mean of whole blocks; a rest of rows or columns is dropped
+    if factor > 1:  # the mean of whole blocks; incomplete blocks are dropped
         rows, columns = gray.shape[0] // factor, gray.shape[1] // factor
         blocks = np.s_[: rows * factor, : columns * factor]
         gray, seen = (cv2.resize(one[blocks], (columns, rows), interpolation=cv2.INTER_AREA) for one in (gray, seen))

@@ -1,11 +1,11 @@
-"""What every matcher returns."""
+"""`Matches`: the result of every matcher."""
 
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
-#: Standard deviation of `u_left`: the point is chosen, not measured, but a patch has no sharper centre than this.
+#: Standard deviation of `u_left`.  The point is chosen, not measured, but the centre of a patch is only this well defined.
 SIGMA_LEFT_PX = 0.05
 
 
@@ -15,12 +15,12 @@ class Matches:
 
     Attributes:
         u_left, u_right: (n, 2) px, integer coordinates at pixel centres.  `u_left` lies on a lattice chosen by the matcher.
-        score: (n,) confidence in [0, 1]; larger is surer.  Comparable within one call, not between methods.
-        covariance_px2: (n, 4, 4) of (u_left, u_right), nearly all of it in the right block (see `SIGMA_LEFT_PX`).
-        peak_ratio: (n,) response at the match over the best one elsewhere; at 1 and below another place fits as well.
-            Infinite where nothing else responds, NaN where there was no other place.
-        reciprocal: (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching,
-            band), or to within a pixel (SGBM, DIS).  `match` drops the others unless told otherwise.
+        score: (n,) confidence in [0, 1], larger is better.  Comparable within one call, not between methods.
+        covariance_px2: (n, 4, 4) of (u_left, u_right); the left block is small (see `SIGMA_LEFT_PX`).
+        peak_ratio: (n,) response at the match over the best one elsewhere; at 1 or below another position fits as well.
+            Infinite if the responses elsewhere are 0, NaN if no other position was searched.
+        reciprocal: (n,) bool, True if matching back from the right image leads to the same left patch (DeepMatching,
+            band), or to within a pixel (SGBM, DIS).  `match` drops the others by default.
         method: Name of the matcher.
         epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
     """

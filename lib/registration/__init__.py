@@ -1,7 +1,7 @@
 """Registration of moved cameras to the robot (paper Sec. IV-C), and the detection of drift.
 
-Calibrated cameras moved by an unknown rigid `motion`, so the stale rig triangulates ``motion.inverse().apply(x_robot)``.
-Every estimate is that motion: it takes points of the stale rig to the robot frame; ``rig.moved(motion)`` is the rig now.
+Calibrated cameras moved by an unknown rigid `motion`, so the old rig triangulates ``motion.inverse().apply(x_robot)``.
+Every estimate is that motion: it maps points of the old rig to the robot frame; ``rig.moved(motion)`` is the current rig.
 """
 
 from lib.registration.drift import DriftMonitor

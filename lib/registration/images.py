@@ -1,8 +1,8 @@
 """Registration in the images: maximum likelihood, for both cameras together or each camera alone.
 
-Triangulation stretches pixel noise along the viewing direction, and Eq. (7) weighs that direction like the others.  In
-the images every pixel is weighed by its own noise, and landmarks that only one camera sees count.  With S = motion^-1,
-moved cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
+Triangulation amplifies pixel noise along the viewing direction, but Eq. (7) weights all directions equally.  In the images
+every pixel is weighted by its own noise, and landmarks that only one camera sees are used, too.  With S = motion^-1, moved
+cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
 """
 
 from contextlib import suppress
@@ -20,10 +20,10 @@ from lib.geometry import RigidTransform, pair_covariance, precision, view_distan
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
-_FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
-_BELIEVED = 20  # rows that the stated noise is worth, beside the scatter of the residuals, in the covariance
-_WRONG = 16.0  # chi-square of an image's two pixels that is no noise: once in 3,000
-_OPEN = 1e-12  # relative curvature below which a direction is not determined
+_FREEDOM = 4.0  # degrees of freedom of Student's t for "robust": gross errors lose their weight, small ones keep it
+_STATED_ROWS = 20  # number of rows that the stated noise counts for, against the residuals' scatter, in the covariance
+_OUTLIER = 16.0  # chi-square of the two coordinates in an image above which it is an outlier (1 in 3,000 by chance)
+_UNDETERMINED = 1e-12  # relative curvature below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
 
@@ -31,20 +31,20 @@ def register_images(
     rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
     covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0, loss: Loss = "squared",
 ) -> Registration:  # fmt: skip
-    """The motion of a rig whose cameras moved together: of points of the stale rig to the robot frame.
+    """The motion of a rig whose cameras moved together; it maps points of the old rig to the robot frame.
 
     Minimises sum r^T C^-1 r, with r = u - rig.project(motion^-1 x) and C = covariance_px2 + sigma_x^2 A A^T.
 
     Args:
         rig: Calibrated before the motion; affine or near-affine cameras.
-        data, u_left, u_right: Correspondences after the motion; or (n, 3) mm as the robot reports the landmarks now,
-            and (n, 2) px as they are detected.  If one image misses a landmark, the other still counts.
-        covariance_px2: Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences;
-            without one, equal and unknown, estimated from the residuals.
+        data, u_left, u_right: Correspondences after the motion; or the landmarks (n, 3) mm as the robot reports them now,
+            and their detections (n, 2) px.  If one image misses a landmark, the other is still used.
+        covariance_px2: Covariance of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the
+            correspondences; if they have none, the noise is equal in all pixels and estimated from the residuals.
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
         loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
 
-    A ValueError refuses shapes that do not pair up, and landmarks that leave the motion open.
+    A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.
 
     >>> from lib.cameras import AffineCamera
     >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
@@ -57,11 +57,11 @@ def register_images(
 
 @dataclass(frozen=True, eq=False)
 class MovedCameras:
-    """Which cameras moved, and the rig as it is now.
+    """The cameras that moved, and the current rig.
 
     `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart".  `left` and `right` are
     the motions of the cameras, None for one that stayed.  An affine camera alone does not show the shift along its viewing
-    direction: that is left at zero, and so is its variance.  `bic` is the information criterion of each hypothesis.
+    direction; the estimate of that is zero, and so is its variance.  `bic` is the information criterion of each hypothesis.
     """
 
     rig: StereoRig
@@ -75,14 +75,14 @@ def identify_motion(
     rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
     covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0,
 ) -> MovedCameras:  # fmt: skip
-    """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
+    """Finds which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
-    The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5; 6 if it is near-affine), both
-    together (6, or 3 if they only shifted), each by its own motion.  If the cameras moved apart, triangulated points are
-    no rigid copy of the true ones, so Eq. (7) has no exact solution; the images have.
+    The hypotheses are: neither camera moved (0 parameters), only the left or only the right one (5; 6 if it is near-affine),
+    both together (6, or 3 if they only shifted), each by its own motion.  If each has its own, triangulated points are no
+    rigid copy of the true ones, so Eq. (7) has no exact solution, but registration in the images has one.
 
-    Arguments and errors are those of `register_images`, and the loss is robust.  The noise must be known, by
-    `covariance_px2` or from the correspondences: it decides whether a hypothesis explains the data.
+    Arguments and errors are those of `register_images`, and the loss is robust.  The noise must be known, from
+    `covariance_px2` or from the correspondences, since it decides whether a hypothesis explains the data.
     """
     observed = _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm)
     if not observed.scale_known:
@@ -90,14 +90,14 @@ def identify_motion(
     together = _register_both(rig, observed, "robust")
     shifted = _fit(rig, observed, [RigidTransform.identity()], "robust", 3)
     stay, rigs, bic = RigidTransform.identity(), {}, {}
-    apart, alone, parameters = [], [], []  # of the left and of the right camera
+    apart, alone, parameters = [], [], []  # for the left and the right camera
     for side, (name, camera) in enumerate((("left", rig.left), ("right", rig.right))):
         check_spread(observed.x[observed.seen[:, side]], f"x_mm (rows seen by the {name} camera)")
         image = replace(observed, seen=observed.seen & (np.arange(2) == side))
         parameters.append(6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5)  # affine: no shift along its axis
         squared = _fit(rig, image, [stay], "squared", parameters[side])
         apart.append(_fit(rig, image, [squared.transform], "robust", parameters[side]))
-        # If the other camera stayed, its image shows the robot's errors, which both images share.
+        # If the other camera stayed, its image helps: the robot's errors are the same in both images.
         both = replace(observed, moves=(side == 0, side == 1))
         alone.append(_fit(rig, both, [apart[side].transform], "robust", parameters[side]))
     hypotheses = {
@@ -114,9 +114,9 @@ def identify_motion(
 
 @dataclass(frozen=True)
 class _Observed:
-    """What the images show while the robot reports: x (n, 3) mm, y (n, 4) px, which of the two images count (n, 2).
+    """Reported positions x (n, 3) mm, pixels y (n, 4), their covariance (n or 1, 4, 4), and the images to use (n, 2) bool.
 
-    `moves`: whether the left and the right camera have the motion that is sought.
+    `moves`: True for the left and for the right camera if it has the unknown motion.
     """
 
     x: np.ndarray
@@ -136,18 +136,18 @@ class _Observed:
         if covariance_px2 is None and np.isfinite(data.covariance_px2[seen]).all():
             covariance_px2 = np.where(np.isfinite(data.covariance_px2), data.covariance_px2, np.eye(2))
         covariance = pair_covariance(covariance_px2, len(data)) + sigma_x_mm**2 * rig.linear @ rig.linear.T
-        # Rows and images that do not count get no information; what stands in them must only be finite.
+        # Rows and images that are not used get no information; their values only have to be finite.
         x = np.where(seen.any(axis=1, keepdims=True), data.x_mm, data.x_mm[seen.any(axis=1)].mean(axis=0))
         return cls(x, np.nan_to_num(data.stacked_px), covariance, seen, covariance_px2 is not None)
 
     @cached_property
     def information(self) -> np.ndarray:
-        """(n, 4, 4): where one image counts, the inverse of that image's own covariance."""
+        """(n, 4, 4) inverse covariances; if only one image is used, the inverse of that image's own covariance."""
         return np.broadcast_to(precision(self.covariance, self.seen), (len(self.x), 4, 4))
 
     @cached_property
     def dimension(self) -> np.ndarray:
-        """(n,) pixel coordinates that count, 0, 2 or 4."""
+        """(n,) number of pixel coordinates that are used: 0, 2 or 4."""
         return 2 * self.seen.sum(axis=1)
 
 
@@ -156,17 +156,17 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     both = data.seen.all(axis=1) & np.isfinite(points.x_mm).all(axis=1)
     starts = [RigidTransform.identity()]
     for kind in ("squared",) if loss == "squared" else ("squared", "norm"):
-        with suppress(ValueError):  # too few landmarks in both images, or on a line
+        with suppress(ValueError):  # too few landmarks in both images, or all on a line
             starts.append(register(points.x_mm[both], data.x[both], loss=kind).transform)
     found = _fit(rig, data, starts, loss, 6)
     if loss == "squared" or not data.scale_known:
         return found
-    for _ in range(3):  # one image may be wrong and the other right
+    for _ in range(3):  # drop outliers in each image separately
         residual = data.y - np.hstack(rig.project(found.transform.inverse().apply(data.x)))
-        seen = data.seen & (view_distances2(residual, data.covariance) < _WRONG)
-        if 2 * seen.sum() < data.seen.sum():  # then the motion is no motion together
+        seen = data.seen & (view_distances2(residual, data.covariance) < _OUTLIER)
+        if 2 * seen.sum() < data.seen.sum():  # then the cameras did not move together
             return found
-        with suppress(ValueError):  # those left leave it open
+        with suppress(ValueError):  # the remaining rows do not determine the motion
             found = _fit(rig, replace(data, seen=seen), [found.transform], loss, 6)
     energy, (_, distance2, weights) = _evaluate(rig, data, loss, found.transform.inverse())
     distance, weights = np.where(data.dimension > 0, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
@@ -174,7 +174,7 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
 
 
 def _evaluate(rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform) -> tuple[float, tuple[np.ndarray, ...]]:
-    """Negative log likelihood but for a constant; residuals (n, 4), chi-squares (n,) and weights (n,) of the rows."""
+    """Negative log likelihood up to a constant; residuals (n, 4), chi-squares (n,) and weights (n,) of the rows."""
     try:
         moved, pair = stale.apply(data.x), zip((rig.left, rig.right), data.moves, strict=True)
         residual = data.y - np.hstack([camera.project(moved if moves else data.x) for camera, moves in pair])
@@ -189,7 +189,7 @@ def _evaluate(rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform
 
 
 def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Loss, parameters: int) -> Registration:
-    """The minimum near the best start, of 6 parameters, 5, or 3: without turning; an unknown noise level is estimated too."""
+    """The minimum near the best start, of 6, 5 or 3 parameters (3: no rotation); also estimates an unknown noise level."""
     if loss not in ("squared", "robust"):
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
     stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, loss, stale)[0])
@@ -205,12 +205,12 @@ def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Lo
 
 
 def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss, parameters: int) -> Registration:
-    # Rotations are about the centre of the data in the stale frame, where they do not mix with translations.
+    # Rotations are about the centre of the data in the old rig's frame, which decorrelates them from translations.
     used, centre = data.dimension > 0, stale.apply(data.x[data.dimension > 0]).mean(axis=0)
     free = np.repeat([parameters > 3, True], 3)
 
     def gradients(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Of each row: information (n, 6, 6) and gradient (n, 6)."""
+        """Information (n, 6, 6) and gradient (n, 6) of each row."""
         x, (residual, _, weights) = stale.apply(data.x), work
         J = rig.jacobian(x) @ (motion_jacobian(x - centre) * free) * np.repeat(data.moves, 2)[:, None]
         JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
@@ -225,19 +225,19 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
 
     found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters, tolerance=1e-11)
     information, (_, distance2, weights) = found.information, found.work
-    if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
-        raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
-    covariance = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
+    if np.linalg.matrix_rank(information, tol=_UNDETERMINED * np.trace(information), hermitian=True) < parameters:
+        raise ValueError("x_mm, u_left, u_right: these landmarks do not determine the motion. Add frames in other positions.")
+    covariance = np.linalg.pinv(information, rcond=_UNDETERMINED, hermitian=True)
     n, size = used.sum(), data.dimension.sum()
     own = covariance * distance2.sum() / max(size - parameters, 1)
     if loss == "robust":
-        # The weights fall with the residual, which bends the loss less than the weights alone say.  Where nothing fits,
-        # the sum may curve the wrong way: then the weights alone.
+        # The weights fall as a residual grows, so the Hessian is smaller than the weighted information.  If nothing fits,
+        # the Hessian may be indefinite; then use the information.
         _, gradient = gradients(found.state, found.work)
-        flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
-        bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
-        own = sandwich(information if bent else flatter, gradient[used], parameters * n / size)
-    covariance = (_BELIEVED * covariance + n * own) / (_BELIEVED + n)
+        hessian = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
+        indefinite = np.linalg.eigvalsh(hessian)[-parameters] <= _UNDETERMINED * np.trace(information)
+        own = sandwich(information if indefinite else hessian, gradient[used], parameters * n / size)
+    covariance = (_STATED_ROWS * covariance + n * own) / (_STATED_ROWS + n)
     motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
     distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, align_rotation, cross, finite_points, points
 
-_STARTS = 12  # minimal triples tried beside the least-squares start
+_STARTS = 12  # random triples of points as initial values, in addition to the least-squares solution
 _ITERATIONS = 300
 
 
@@ -16,12 +16,12 @@ _ITERATIONS = 300
 class Registration:
     """An estimated rigid motion `transform`, target_from_source, and its uncertainty.
 
-    `covariance` (6, 6) is that of a small error (rotation omega in rad, translation tau in mm) in the target frame: a
-    registered point p is off by omega x (p - centre_mm) + tau, where `centre_mm` (3,) is the centre of the data.
+    `covariance` (6, 6) belongs to a small error (rotation omega in rad, translation tau in mm) in the target frame: the
+    error of a registered point p is omega x (p - centre_mm) + tau, where `centre_mm` (3,) is the centre of the data.
 
-    `residuals` (n,) has the norm of each row in mm (`register`) or its Mahalanobis distance (`register_images`), NaN
-    where it was not used.  `weights` (n,) says what each row counted in the last step, 1 = fully.  `cost` is the minimum
-    reached, in the estimator's own terms.
+    `residuals` (n,) has the norm of each row's residual in mm (`register`) or its Mahalanobis distance (`register_images`),
+    NaN where a row was not used.  `weights` (n,) are the rows' weights in the last step, 1 = full.  `cost` is the minimum
+    of the estimator's own loss.
     """
 
     transform: RigidTransform
@@ -43,30 +43,30 @@ class Registration:
 
 
 def motion_jacobian(offset: np.ndarray) -> np.ndarray:
-    """(n, 3, 6): how points at `offset` (n, 3) from the centre of rotation move with (omega, tau)."""
+    """(n, 3, 6): derivative by (omega, tau) of points at `offset` (n, 3) from the centre of rotation."""
     return np.concatenate([cross(np.eye(3), offset[:, None]).mT, np.tile(np.eye(3), (len(offset), 1, 1))], axis=2)
 
 
 def check_spread(x: np.ndarray, name: str) -> None:
-    """Raise a ValueError for fewer than three points, and for points on a line: they leave a rotation open."""
+    """Raise a ValueError for fewer than three points, and for points on a line: they do not determine the rotation."""
     if len(x) < 3:
         raise ValueError(f"{name}: {len(x)} points; a rigid motion needs at least 3 that are not on a line.")
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     if spread[1] <= 1e-6 * max(spread[0], 1e-12 * max(1.0, np.abs(x).max())):
-        raise ValueError(f"{name}: the points lie on one line or coincide; the rotation about it is open. Add frames.")
+        raise ValueError(f"{name}: the points lie on one line or coincide; the rotation about it is unknown. Add frames.")
 
 
 def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", "squared"] = "norm") -> Registration:
-    """The rigid transform that takes `x_source` to `x_target`, point by point (paper Eq. 7).
+    """The rigid transform that maps `x_source` to `x_target`, point by point (paper Eq. 7).
 
     Args:
         x_source, x_target: (n, 3) mm, n >= 3; in the paper the triangulated landmarks and the robot's report of them.
         loss: "norm" minimises sum |R x + t - y|, Eq. (7) as printed: robust, solved by iteratively reweighted least
-            squares from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
+            squares from several initial values.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
 
-    The covariance is the sandwich of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise but many
-    points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.  A ValueError refuses
-    rows that do not pair up, NaN, fewer than three points, and points on a line.
+    The covariance is the sandwich of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise, but needs
+    many points: below about ten it is unreliable.  With "norm", standard deviations are accurate to about 30 %.  A ValueError
+    refuses arrays of different lengths, NaN, fewer than three points, and points on a line.
 
     >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2], [3, 3, 0], [2, 0, 1]])
     >>> y = x + [0.5, 0.25, -1]
@@ -90,7 +90,7 @@ def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", 
     weights = np.ones(len(x)) if loss == "squared" else 1.0 / np.maximum(norm, max(1e-6 * median, 1e-12))
     centre = weights @ y0 / weights.sum()
     curvature, pull = np.broadcast_to(np.eye(3), (len(x), 3, 3)), residual
-    if loss == "norm":  # it has no curvature to measure at a point: take that of sqrt(r^2 + s^2), s of the residuals' size
+    if loss == "norm":  # its Hessian is singular at r = 0: take that of sqrt(r^2 + s^2), with s of the residuals' size
         length = np.hypot(norm, max(0.4 * median, 1e-12))[:, None]
         direction, pull = residual / length, residual / np.maximum(norm, 1e-300)[:, None]
         curvature = (curvature - direction[:, :, None] * direction[:, None, :]) / length[:, None]
@@ -110,7 +110,7 @@ def _kabsch(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarr
 
 
 def _sum_of_norms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weiszfeld's iteration with a rotation in it, from the least-squares start and from minimal triples."""
+    """Weiszfeld's iteration, extended by a rotation, from the least-squares solution and from triples of points."""
     rng = np.random.default_rng(0)
     triples = [np.isin(np.arange(len(x)), rng.choice(len(x), 3, replace=False)) for _ in range(_STARTS)]
     R, t = _kabsch(x, y, np.array([np.ones(len(x)), *triples]))
@@ -118,7 +118,7 @@ def _sum_of_norms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     for iteration in range(_ITERATIONS):
         norm = np.linalg.norm(x @ np.swapaxes(R, 1, 2) + t[:, None] - y, axis=2)
         cost = norm.sum(axis=1)
-        if iteration == 8:  # the basins are settled: go on with the deepest
+        if iteration == 8:  # the ranking is settled: continue only with the best
             best = [int(cost.argmin())]
             R, t, norm, cost, before = R[best], t[best], norm[best], cost[best], before[best]
         if iteration >= 8 and before[0] - cost[0] <= 1e-14 * cost[0] + floor:

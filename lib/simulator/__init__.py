@@ -1,6 +1,6 @@
-"""Recordings with known truth: eye, forceps, microscope and motion of the reference rig.
+"""Simulated recordings with ground truth: eye, forceps, microscope and motion of the reference rig.
 
-Everything here is in the microscope frame (see `rig.py`).  Only a recording that is written is in the robot frame.
+Everything here is in the microscope frame (see `rig.py`).  Only written recordings are in the robot frame.
 """
 
 from lib.simulator.eye import Eye

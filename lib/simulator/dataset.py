@@ -27,12 +27,12 @@ _MB_PER_PAIR = 0.62
 
 
 def sequence_name(index: int) -> str:
-    """Folder of a sequence: ``train_00`` to ``test_09``."""
+    """Name of a sequence's folder: ``train_00`` to ``test_09``."""
     return f"{'train' if index in TRAIN_SEQUENCES else 'test'}_{index:02d}"
 
 
 def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float = 60.0) -> Design:
-    """Eye, tool, microscope and clock of sequence `index` of the data set of this seed, its images `shrink` times smaller."""
+    """Draw eye, tool, microscope and clock of sequence `index` of the data set `seed`; images are `shrink` times smaller."""
     rng = np.random.default_rng([seed, 211, index])
     # Test sequences have eyes and tools that the training sampler never draws.
     if index in TEST_SEQUENCES:
@@ -57,11 +57,11 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float
 
 
 def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
-    """What recording `seed` of a rung of shift shows: new eyes and tools, in stereo, as `sample` draws them singly.
+    """Design of recording `seed` with a distribution shift: stereo, with new eyes and tools, as `sample` draws for one view.
 
-    The rung is "near", the reference rig's families, "validation", or one of `families.FAR`.
+    `rung` is the kind of shift: "near" (the families of the reference rig), "validation", or one of `families.FAR`.
     """
-    if rung == "near":  # seeds that no data set of the paper's size was ever made with
+    if rung == "near":  # seeds that no data set of the paper's size uses
         return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
     drawn = random_setup(np.random.default_rng([seed, 307, *rung.encode()]), rung, centred=True)
     like = sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
@@ -74,10 +74,10 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
 def make_dataset(
     folder: Path, *, seed: int = 0, n_pairs: int = 80, duration_s: float = 60.0, workers: int | None = None, shrink: int = 1
 ) -> list[Path]:  # fmt: skip
-    """Make the sequences of `n_pairs` that are missing in `folder`, in parallel; files depend on seed and size alone.
+    """Make the sequences of `n_pairs` that `folder` lacks, in parallel.  The files depend only on seed and size.
 
-    A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.  `workers` are
-    processes, None is one a core.  A ValueError refuses a folder with a data set of another seed or size.
+    A sequence appears whole or not at all: after a kill, the next call keeps the finished ones and makes the others.
+    `workers` is the number of processes; None = one per core.  Raises ValueError if `folder` holds another data set.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stamp = folder / "dataset.json"
@@ -87,7 +87,7 @@ def make_dataset(
         raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
     files.write_text(stamp, text)
     for leftover in folder.glob("t*_??.*.partial"):
-        shutil.rmtree(leftover)  # of a run that was killed
+        shutil.rmtree(leftover)  # from a killed run
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
     make = partial(simulate, description="Simulated data set: calibration sweep, then a surgeon's movements.", progress=False)
@@ -98,9 +98,9 @@ def make_dataset(
 
 
 def seconds_a_pair(shrink: int) -> float:
-    """CPU seconds of a stereo pair of the data set on this machine, measured on two pairs; the eye's texture excluded."""
+    """CPU seconds per stereo pair of the data set on this machine, measured on two pairs, without the eye's texture."""
     design = sequence_design(0, TEST_SEQUENCES[0], shrink=shrink, duration_s=1.5)
-    design.eye.texture  # noqa: B018 - once an eye, not once a pair
+    design.eye.texture  # noqa: B018 - made once per eye, not once per pair
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()
         simulate(Path(folder) / "pairs", design, n_frames=2, progress=False)
@@ -108,17 +108,17 @@ def seconds_a_pair(shrink: int) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """`python3 -m lib simulate`: the data set, where it stopped; the shipped recording; or one of a rung of shift."""
+    """`python3 -m lib simulate`: make or continue the data set, make the shipped recording, or one with another shift."""
     parser = argparse.ArgumentParser(prog="python3 -m lib simulate", description=__doc__)
-    parser.add_argument("--folder", type=Path, help="where (default: data/cache/dataset-SEED)")
+    parser.add_argument("--folder", type=Path, help="folder to write (default: data/cache/dataset-SEED)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pairs", type=int, default=80, help="stereo pairs a sequence (default: 80, 1600 images in all)")
-    parser.add_argument("--duration", type=float, default=60.0, help="seconds of motion a sequence (default: 60)")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument("--shrink", type=int, default=1, help="images this many times smaller, for a quick look")
-    parser.add_argument("--dry-run", action="store_true", help="only say how long it takes and how many GB")
-    parser.add_argument("--shipped", action="store_true", help="make data/open_sky_eye anew instead")
-    parser.add_argument("--rung", choices=("near", "validation", *FAR), help="make one recording of a rung of shift instead")
+    parser.add_argument("--pairs", type=int, default=80, help="stereo pairs per sequence (default: 80, 1600 images in all)")
+    parser.add_argument("--duration", type=float, default=60.0, help="seconds of motion per sequence (default: 60)")
+    parser.add_argument("--workers", type=int, help="number of processes (default: one per core)")
+    parser.add_argument("--shrink", type=int, default=1, help="make images this many times smaller, for a quick look")
+    parser.add_argument("--dry-run", action="store_true", help="only print the time and the disk space that it takes")
+    parser.add_argument("--shipped", action="store_true", help="make data/open_sky_eye again instead")
+    parser.add_argument("--rung", choices=("near", "validation", *FAR), help="make one recording with this shift instead")
     arguments = parser.parse_args(argv)
     if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
@@ -126,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--seed must not be negative, --duration must be positive and finite.")
     pairs, shrink, seed = arguments.pairs, arguments.shrink, arguments.seed
     if arguments.shipped or arguments.rung:
-        if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
+        if arguments.shipped:  # with an eye and a tool that no training saw
             recording = simulate(
                 paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=27, n_frames=34,
                 name="Open-sky eye, simulated", overwrite=True,
@@ -140,11 +140,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{seed}"
     made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
-    for sequence in made:  # what is there must open as a recording
+    for sequence in made:  # finished sequences must open as recordings
         try:
             Recording.open(sequence)
         except (ValueError, OSError) as error:
-            raise ValueError(f"{sequence}: damaged ({error}). Delete the folder and it is made anew.") from error
+            raise ValueError(f"{sequence}: damaged ({error}). Delete the folder to make it again.") from error
     left = (len(_SEQUENCES) - len(made)) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))
     minutes = left * seconds_a_pair(shrink) / workers / 60 if left else 0.0

@@ -1,4 +1,4 @@
-"""Scenes: smooth height fields z(x, y) in the microscope frame with a texture, of an eye's fundus or of anything."""
+"""Scenes: textured smooth height fields z(x, y) in the microscope frame, for the fundus of an eye or any other surface."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,11 +15,11 @@ _FUNDUS_PX, _FILMS = 1024, 8
 
 
 class Scene(Protocol):
-    """What the renderer needs of a surface.  Lengths are mm in the microscope frame (z points into the eye).
+    """A surface for the renderer.  Lengths are mm in the microscope frame (z points into the eye).
 
     `height(x, y)` is the surface z.  `texture` is its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
-    around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.  Optional are
-    `texture_from_surface` (2, 3), which maps (x, y, 1) to the texture, and `step_px`, 8 or less if the surface is rough.
+    around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.  Optional: the map
+    `texture_from_surface` (2, 3) from (x, y, 1) to mm in the texture; `step_px` between rays, 8 or less if rough.
     """
 
     gloss: float
@@ -31,13 +31,13 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Eye:
-    """An open-sky eye: a soft bowl with folds and tilt, the cut rim at the border of the field.
+    """An open-sky eye: a smooth bowl with folds and tilt, with the cut rim at the border of the field.
 
     Attributes:
-        seed: Draws the folds, the tilt and the procedural texture.
-        radius_mm, depth_mm: Radius of the cut rim, and how far the deepest point lies below it.
+        seed: Seed of the folds, the tilt and the procedural texture.
+        radius_mm, depth_mm: Radius of the cut rim, and depth of the bowl's deepest point below it.
         fold_mm, tilt_rad: Amplitude of the retina's folds, and standard deviation of the tilt about x and y.
-        centre_z_mm: Height of the deepest point; 0 is the focal plane, positive is deeper.
+        centre_z_mm: z of the deepest point; 0 is the focal plane, positive is deeper.
         texture_path: A photograph that replaces the procedural texture.
         gloss: Strength of the reflection of the wet surface; 0 switches it off.
         turn_rad: Rotation of the texture on the surface, so that one texture serves many eyes.
@@ -65,7 +65,7 @@ class Eye:
 
     @property
     def texture_from_surface(self) -> np.ndarray:
-        """(2, 3): texture coordinates (mm from its middle) of the surface point over (x, y)."""
+        """(2, 3): maps (x, y, 1) of a surface point to texture coordinates in mm from the texture's middle."""
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
         return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0]])
 
@@ -100,12 +100,12 @@ class Eye:
 
 @dataclass(frozen=True)
 class Ground(Eye):
-    """A surface with any texture.  `border` is what lies beyond it, in OpenCV's terms.
+    """A surface with any texture.  `border` is OpenCV's border mode, which continues the texture.
 
     Attributes:
         kind: "fundus", or the name of a pattern (`lib.simulator.texture`).
         extent_mm: Side of the square that one texture covers; its mirror images cover the rest.
-        colours: Linear reflectances (k, 3), from dark to bright texture; none = a fundus in its own colours.
+        colours: Linear reflectances (k, 3), from dark to bright texture; empty = a fundus in its own colours.
         over, over_share: A second texture that is mixed with the first, and its share.
     """
 
@@ -118,7 +118,7 @@ class Ground(Eye):
 
     @property
     def film_seed(self) -> int:
-        """Seed of the wet film's ripples: few, as they are kept in memory."""
+        """Seed of the wet film's ripples.  There are few, because films are kept in memory."""
         return self.seed % _FILMS
 
     @cached_property

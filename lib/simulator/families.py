@@ -1,8 +1,8 @@
-"""Families of everything that an image depends on, by aspect: tool, light, scene, optics.
+"""Families of everything on which an image depends, by aspect: tool, light, scene, optics.
 
-Training draws from `TRAINING`.  Validation draws the same, and whole families of its own (`SHIFTED`).  The tests of the far
-rung draw families (`FAR`) that neither training nor validation ever sees.  A family is a function that draws one
-member of it; its name can be given to `sample(..., without=...)`.  How ranges are written, see `draw`.
+Training draws from `TRAINING`.  Validation draws from the same families, and from some of its own (`SHIFTED`).  Tests with a
+large shift draw from families (`FAR`) that neither training nor validation uses.  A family is a function that draws one of
+its members; its name can be given to `sample(..., without=...)`.  `draw` explains the notation of ranges.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ ASPECTS = ("tool", "light", "scene", "optics")
 
 
 def draw(rng: Rng, value: Any) -> Any:
-    """(low, high) is a uniform range, (low, high, "log") a log-uniform one, a list a choice of these; else the value itself.
+    """Draw uniformly from (low, high), log-uniformly from (low, high, "log"), or from an item of a list; keep other values.
 
     >>> draw(np.random.default_rng(0), [12]), draw(np.random.default_rng(0), (2.0, 2.0))
     (12, 2.0)
@@ -36,19 +36,19 @@ def draw(rng: Rng, value: Any) -> Any:
 
 
 def drawn(rng: Rng, ranges: Mapping[str, Any]) -> dict[str, Any]:
-    """One value for each name."""
+    """Draw one value for each name."""
     return {name: draw(rng, value) for name, value in ranges.items()}
 
 
 def _hue(rng: Rng, spread: float = 0.5, level: float = 1.0) -> tuple[float, float, float]:
-    """A colour (3,) of mean `level`."""
+    """Draw a colour (3,) of mean `level`."""
     gain = np.exp(rng.normal(0, spread, 3))
     return tuple((level * gain / gain.mean()).tolist())
 
 
 # --- tool: functions of (rng, size), and objects that have no landmarks
 
-#: Family -> ranges of its jaws' shapes, the arguments of `_jaw`.
+#: Family -> ranges of the arguments of `_jaw`.
 _JAWS: dict[str, dict[str, Any]] = {
     "plain_jaws": {"bow": (0.005, 0.13), "thick": (0.025, 0.06), "bend": (-0.05, 0.12), "flex": (0.2, 0.8)},
     "needle_jaws": {"bow": (0, 0.05), "thick": (0.012, 0.03), "taper": (0.3, 1.2)},
@@ -76,15 +76,15 @@ def _jaw(
     bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14,
     start: float = 0.5, cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
 ) -> Jaw:  # fmt: skip
-    """A jaw of `n` cones, on `side` +1 or -1; lengths are shares of `length`, angles rad.
+    """Make a jaw of `n` nodes, on `side` +1 or -1; lengths are shares of `length`, angles rad.
 
     Args:
-        long, bend: Its own length, and how far it leaves the plane of the jaws.
-        bow, power, skew: How far it arches outwards, how evenly, and where most.
+        long, bend: Its own length, and the distance by which its end leaves the plane of the jaws.
+        bow, power, skew: Height of the outward arch, and exponents of its shape and of the position of its top.
         thick, end, taper: Radii at both ends, and the exponent between.
-        start: Where a cup, teeth, a ring or a kink begins.
+        start: Position where a cup, teeth, a ring or a kink begins.
         cup, teeth, ring: Radius that a cup adds, height of teeth in radii, and half width of a ring.
-        claw, turn: Angles of a kink: inwards, or both jaws to one side.
+        claw, turn: Angle of a kink inwards, or of a kink of both jaws to the same side.
     """
     s = 1 - (1 - np.linspace(0, 1, n)) ** 1.3
     beyond = np.clip((s - start) / (1 - start), 0, 1)
@@ -120,7 +120,7 @@ def _finish(rng: Rng) -> Finish:
 
 
 def _profile(rng: Rng, radius: float) -> tuple[tuple[float, float], ...]:
-    """A plain shaft, or one with a step, a taper, a sleeve at its end or a collar."""
+    """Draw the profile of a shaft: plain, or with a step, a taper, a sleeve at its end or a collar."""
     kind, a, b = rng.integers(6), radius * rng.uniform(0.5, 3), radius * rng.uniform(1, 8)
     wide = radius * rng.uniform(1.15, 1.8)
     return {
@@ -132,7 +132,7 @@ def _profile(rng: Rng, radius: float) -> tuple[tuple[float, float], ...]:
 
 
 def _tool(family: str, rng: Rng, size: float) -> Instrument:
-    """A tool of that family with jaws of 2 to 4 mm times `size`."""
+    """Draw a tool of a family, with jaws of 2 to 4 mm times `size`."""
     length = rng.uniform(2.0, 4.0) * size
     common = {"taper": (0.3, 1.2), "flex": (0, 0.9), "bend": (-0.12, 0.12)} | _JAWS[family]
     first = second = drawn(rng, common)
@@ -152,7 +152,7 @@ TOOLS = {family: partial(_tool, family) for family in _JAWS}
 
 
 def random_object(rng: Rng, size: float) -> Instrument:
-    """A needle, light pipe, cannula, hook or scissors: it has none of the landmarks."""
+    """Draw a needle, light pipe, cannula, hook or scissors, which have none of the landmarks."""
     radius, kind = 0.3 * size * rng.uniform(0.6, 1.5), rng.choice(["needle", "pipe", "cannula", "hook", "scissors"])
     long, profile, jaws = radius * rng.uniform(4, 12), ((0.0, radius),), ()
     if kind == "needle":
@@ -169,7 +169,7 @@ def random_object(rng: Rng, size: float) -> Instrument:
 
 
 def beside(rng: Rng, tool: Instrument, size: float, base_mm: np.ndarray, surface_z_mm: float) -> Instrument:
-    """The tool with another object that stands still near `base_mm`."""
+    """Returns the tool with another object beside it, which stands still near `base_mm`."""
     place = (*(base_mm[:2] + rng.normal(0, 3.0, 2)), surface_z_mm - rng.uniform(0.2, 3.0))
     pose = Pose(tuple(float(v) for v in place), rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.9), opening_mm=0.0)
     return replace(tool, others=((random_object(rng, size * rng.uniform(0.6, 1.6)), pose),))
@@ -182,10 +182,10 @@ def _light(
     rng: Rng, microscope: Microscope, middle: np.ndarray, length: float, ground: float, *,
     patches: Callable[..., Iterator[Patch]] | None = None, **ranges: Any,
 ) -> Microscope:  # fmt: skip
-    """The microscope under a light whose `Lighting` has these ranges, with `patches` in it, and
+    """Returns the microscope with a `Lighting` drawn from `ranges` and with `patches`.  Ranges can also have
 
-    slope: how far a shadow moves, mm per mm of height;  lamp: probability of a lamp near the scene;
-    spot: radius of the lit spot in lengths of the jaws;  hue: spread of the colour;  power: exposure;  haze_level.
+    slope: shift of a shadow, mm per mm of height;  lamp: probability of a lamp near the scene;
+    spot: radius of the lit spot in jaw lengths;  hue: spread of the colour;  power: exposure;  haze_level.
     """
     common = {"ambient": (0.15, 0.9), "tool": (0.3, 1.6, "log"), "shadow": (0, 0.8), "shadow_sigma_mm": (0.03, 0.5, "log")}
     value = drawn(rng, common | {"hue": [0.1, 0.5], "power": 1.0, "haze_level": 0.0, "lamp": 0.0} | ranges)
@@ -213,7 +213,7 @@ def _patch(rng: Rng, at: np.ndarray, radius: float, colour: Sequence[float], rol
 
 
 def _glare(rng: Rng, middle: np.ndarray, length: float, ground: float) -> Iterator[Patch]:
-    """Large hard glare on the scene, and reflections of lenses before it."""
+    """Large hard glare on the scene, and reflections of lenses in front of it."""
     for _ in range(rng.integers(1, 5)):
         role, share = ("glare", 1.0) if rng.random() < 0.75 else ("flare", rng.uniform(0.1, 0.6))
         at = np.append(middle[:2] + rng.normal(0, 3.0, 2), ground)
@@ -230,7 +230,7 @@ def _cover(rng: Rng, middle: np.ndarray, length: float, ground: float) -> Iterat
 
 
 def _pupil(rng: Rng, middle: np.ndarray, length: float, ground: float) -> Iterator[Patch]:
-    """The edge of a pupil, dark beyond, and light that lenses reflect outside it."""
+    """The edge of a pupil, dark outside, where lenses may reflect light."""
     radius = length * rng.uniform(0.9, 3.0)
     away = rng.uniform(-0.7, 0.7, 2) * radius * (1.0 if rng.random() < 0.2 else 0.4)
     at = np.append(middle[:2] + away, min(middle[2], ground) - rng.uniform(0, 2.0))
@@ -245,12 +245,12 @@ def _pupil(rng: Rng, middle: np.ndarray, length: float, ground: float) -> Iterat
 
 # --- scene: functions of (rng, texture seeds)
 
-_FUNDI, _PATTERNS = 32, 12  # textures of a kind that are kept in memory
+_FUNDI, _PATTERNS = 32, 12  # number of fundi, and of textures of each pattern, which are kept in memory
 _TRAINED = ("smooth", "grainy", "membranes", "blood", "fibres", "vessels", "paper", "skin", "brushed", "dots")
 
 
 def _colours(rng: Rng) -> tuple[tuple[float, float, float], ...]:
-    """Two to four reflectances: like tissue, grey, or any."""
+    """Draw two to four reflectances: like tissue, grey, or any."""
     n, kind = int(rng.integers(2, 5)), rng.choice(["tissue", "grey", "any"], p=[0.35, 0.15, 0.5])
     level = rng.uniform(0.02, 0.85, n)
     level = np.sort(level) if rng.random() < 0.8 else level
@@ -261,7 +261,7 @@ def _colours(rng: Rng) -> tuple[tuple[float, float, float], ...]:
 
 
 def _ground(kind: str, rng: Rng, seeds: Sequence[int], *, overlay: bool = True) -> Ground:
-    """A scene of one texture; a procedural one is sometimes mixed with another."""
+    """Draw a scene of one texture; a pattern is sometimes mixed with another."""
     fundus = kind == "fundus"
     value = drawn(rng, {
         "depth_mm": (0.0, 3.2), "fold_mm": (0.0, 0.18), "tilt_rad": (0.0, 0.1), "centre_z_mm": (0.2, 1.8),
@@ -274,7 +274,7 @@ def _ground(kind: str, rng: Rng, seeds: Sequence[int], *, overlay: bool = True) 
     return Ground(seed=int(seeds[rng.integers(count)]), kind=kind, colours=colours, over=over, **value)
 
 
-# --- optics: functions of (rng) that draw settings of `Video`
+# --- optics: functions of (rng) that draw attributes of `Video`
 
 
 def _camera(rng: Rng, *, colours: Callable[[Rng], np.ndarray] | None = None, **ranges: Any) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def _camera(rng: Rng, *, colours: Callable[[Rng], np.ndarray] | None = None, **r
 
 
 def _cast(rng: Rng) -> np.ndarray:
-    """Colours mixed, exchanged or washed out."""
+    """Draw a colour matrix (3, 3) that mixes, exchanges or washes out the colours."""
     share, order = rng.uniform(0, 0.7), rng.permutation(3) if rng.random() < 0.5 else np.arange(3)
     return ((1 - share) * np.eye(3)[order] + share * rng.dirichlet([1.0] * 3, 3)) * np.array(_hue(rng, 0.3))[:, None]
 
@@ -294,7 +294,7 @@ SHIFTED: dict[str, dict[str, Callable]] = {
     "scene": {"stones": partial(_ground, "stones")},
     "optics": {"mosaic": partial(_camera, mosaic=True, noise=(0, 0.03), sharpening=(0, 1.5))},
 }
-#: Family of the far rung -> what it replaces in each aspect.
+#: Family with a large shift -> what it replaces in each aspect.
 FAR: dict[str, dict[str, Callable]] = {
     "angled_jaws": {"tool": TOOLS["angled_jaws"]},
     "slit_light": {"light": partial(_light, ambient=(0.06, 0.2), band_rad=(0, np.pi), spot=(0.5, 1.2), spot_edge=(0.1, 0.5))},

@@ -1,9 +1,9 @@
-"""Tools as chains of round cones, with their landmarks: the reference forceps, and instruments of any shape.
+"""Tools and their landmarks, as chains of round cones: the reference forceps, and instruments of any shape.
 
 Tool frame: the origin is the base, where the jaws leave the shaft's axis; x runs along the shaft towards the tips, y points
 towards jaw 1, z = x cross y.  A tip is the farthest point of a jaw on its own centre line; of a ring or a spoon, its far end.
-Jaw 1 is the left jaw for an observer at the microscope who looks along the shaft towards the tips, and so in every image
-that is not mirrored: `Pose` limits the roll about the shaft to 60 degrees.
+Jaw 1 is the left jaw for an observer at the microscope who looks along the shaft towards the tips.  It is also the left jaw
+in every image that is not mirrored, because `Pose` limits the roll about the shaft to 60 degrees.
 """
 
 import math
@@ -17,7 +17,7 @@ MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
 MAX_TIP_RADIUS_MM = 0.02
 _SHAFT_MM = 40.0
-_ALONG = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # a jaw of `Forceps`, denser towards the tip
+_ALONG = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # positions along a jaw of `Forceps`, denser towards the tip
 _BOW, _HOOK = np.sin(np.pi * _ALONG) ** 1.2, np.clip((_ALONG - 0.6) / 0.2, 0, 1) * np.clip((1 - _ALONG) / 0.2, 0, 1)
 
 #: Round cones: centres (n, 3) in the microscope frame, radii (n,) mm, and the chain (n,) that each belongs to.
@@ -26,10 +26,10 @@ Nodes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the tool is, in the microscope frame: its base (3,), its direction, and the distance between its tips.
+    """The tool's pose in the microscope frame: its base (3,), its direction, and the distance between its tips.
 
-    `azimuth_rad` is the direction from base to tips in the image plane, from x (right) towards y (down).  By `pitch_rad`
-    the tips dip below the base, into the eye.  `roll_rad` turns the tool about its shaft; at 0 both jaws are equally deep.
+    `azimuth_rad` is the direction from base to tips in the image plane, from x (right) towards y (down).  `pitch_rad` is the
+    angle by which the tips point into the eye.  `roll_rad` turns the tool about its shaft; at 0 both jaws are equally deep.
     """
 
     base_mm: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -54,7 +54,7 @@ class Pose:
         return turn @ np.diag([1.0, -1.0, -1.0]) @ np.array([[1.0, 0.0, 0.0], [0.0, e, -f], [0.0, f, e]])
 
     def place(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the tool frame in the microscope frame."""
+        """Transform points (n, 3) mm from the tool frame to the microscope frame."""
         return points @ self.microscope_from_tool.T + np.asarray(self.base_mm)
 
 
@@ -66,8 +66,8 @@ class Forceps:
         shaft_radius_mm: 0.3 is the usual 23 gauge, 0.6 mm thick.
         jaw_length_mm: From the base to the tips of the closed tool, along the shaft's axis.
         jaw_radius_mm, tip_radius_mm, taper: Radii of a jaw at its ends, and the exponent between; 1 is a cone.
-        bow_mm, bend_mm, hook_mm: How far each closed jaw arches outwards in its middle, both tips bend out of the jaws'
-            plane towards the retina, and the last fifth of a jaw turns inwards.
+        bow_mm, bend_mm, hook_mm: Distances by which each closed jaw arches outwards in its middle, by which both tips bend
+            out of the jaws' plane towards the retina, and by which the last fifth of a jaw turns inwards.
         brightness, brushed: Reflectance of the metal, and contrast of its brush marks.
     """
 
@@ -88,15 +88,15 @@ class Forceps:
         radii = self.tip_radius_mm, self.jaw_radius_mm, self.shaft_radius_mm
         if not radii[0] <= radii[1] <= radii[2]:
             raise ValueError(f"tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got {radii}.")
-        rule = f"beyond {MAX_TIP_RADIUS_MM} a tip is no point to measure"
+        rule = f"beyond {MAX_TIP_RADIUS_MM} a tip is not a point"
         check(self, "tip_radius_mm", lambda v: v <= MAX_TIP_RADIUS_MM, rule)
         check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
     def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centreline (n, 3) in the tool frame, radii (n,), and the landmark one tip radius beyond the line; +1 is jaw 1."""
+        """Centre line (n, 3) in the tool frame, radii (n,), and the landmark one tip radius beyond the line; +1 is jaw 1."""
         s, half, root = _ALONG, max(opening_mm / 2, self.tip_radius_mm), 0.45 * self.jaw_radius_mm
         y = root * (1 - s) ** 2 + self.bow_mm * _BOW + self.hook_mm * _HOOK + half * s**1.5
-        # Opening the jaws turns them, it does not stretch them.
+        # Opening the jaws rotates them and does not stretch them.
         x = s * np.sqrt(max(self.jaw_length_mm**2 - max(half - self.tip_radius_mm, 0) ** 2, 1e-6))
         line = np.column_stack([x, side * y, -self.bend_mm * s**2])
         radii = self.tip_radius_mm + (self.jaw_radius_mm - self.tip_radius_mm) * (1 - s) ** self.taper
@@ -105,7 +105,7 @@ class Forceps:
         return line, radii, tip
 
     def landmarks(self, pose: Pose) -> np.ndarray:
-        """base, tip_1, tip_2 (3, 3) mm in the microscope frame."""
+        """Positions (3, 3) mm of base, tip_1 and tip_2 in the microscope frame."""
         return pose.place(np.array([np.zeros(3), *(self._jaw(side, pose.opening_mm)[2] for side in (+1, -1))]))
 
     def nodes(self, pose: Pose) -> Nodes:
@@ -119,9 +119,9 @@ class Forceps:
 
 @dataclass(frozen=True)
 class Finish:
-    """How a surface looks: `colour` is its linear reflectance (3,), 0.02 is black, 0.9 a mirror.
+    """The look of a surface: `colour` is its linear reflectance (3,); 0.02 is black, 0.9 a mirror.
 
-    `matt` and `mirror` are the shares of it that scatter evenly, and that reflect the field and the sky.  `shine` and
+    `matt` and `mirror` are the shares of diffuse reflection, and of mirror reflection of the scene and the sky.  `shine` and
     `sharpness` are the strength of the lamp's highlight and its exponent, `brushed` the contrast of marks along the part.
     """
 
@@ -135,10 +135,10 @@ class Finish:
 
 @dataclass(frozen=True, eq=False)
 class Jaw:
-    """A closed jaw in the tool frame; y is the distance from the plane between the jaws, whichever jaw it is.
+    """A closed jaw in the tool frame; y is the distance from the plane between the jaws, for either jaw.
 
     `line` (n, 3) and `radii` (n,) mm are its round cones, from the base; `tip` is the farthest point (3,) on its centre
-    line.  With `flex` 0 it turns as one piece, with 1 it bends towards the tip.  It has a `share` of the opening.
+    line.  With `flex` 0 it opens as a rigid piece, with 1 it bends towards the tip.  `share` is its share of the opening.
     """
 
     line: np.ndarray
@@ -148,7 +148,7 @@ class Jaw:
     share: float = 0.5
 
     def opened(self, side: int, opening_mm: float) -> np.ndarray:
-        """Centres and tip (n + 1, 3) when the tips are about `opening_mm` apart; `side` is +1 for jaw 1."""
+        """Centres and tip (n + 1, 3) of the opened jaw, with the tips about `opening_mm` apart; `side` is +1 for jaw 1."""
         x, y, z = np.vstack([self.line, self.tip]).T
         angle = 2 * self.share * np.arcsin(np.clip(opening_mm / 2 / np.hypot(*self.tip[:2]), 0.0, 0.71))
         angle = angle * np.clip(x / max(self.tip[0], 1e-3), 0, 1) ** self.flex
@@ -161,11 +161,11 @@ class Instrument:
     """A tool of two jaws, or an object without landmarks.
 
     Attributes:
-        jaws: Two jaws; of an object without landmarks, up to two parts that move with its shaft.
-        profile: (k, 2) distance behind the base and radius, mm, from the base outwards: steps, necks and collars.
-        finishes: Of the shaft, and of the jaws.
+        jaws: Two jaws; for an object without landmarks, up to two parts that move with its shaft.
+        profile: (k, 2) distance behind the base and radius of the shaft, mm, from the base outwards.
+        finishes: Finish of the shaft, and of the jaws.
         bend_per_mm: Curvature of the shaft.
-        others: Objects that stand still beside it, each with its pose.
+        others: Objects that stand still beside the tool, each with its pose.
     """
 
     jaws: tuple[Jaw, ...]
@@ -183,23 +183,23 @@ class Instrument:
 
     @property
     def shaft_radius_mm(self) -> float:
-        """At the base."""
+        """Radius of the shaft at the base."""
         return self.profile[0][1]
 
     @property
     def tip_radius_mm(self) -> float:
-        """Radius of the ball in which the blunter jaw ends."""
+        """Radius of the ball at the end of the blunter jaw."""
         return max((float(jaw.radii[-1]) for jaw in self.jaws), default=0.0)
 
     def landmarks(self, pose: Pose) -> np.ndarray:
-        """base, tip_1, tip_2 (3, 3) mm in the microscope frame; NaN for an object without landmarks."""
+        """Positions (3, 3) mm of base, tip_1 and tip_2 in the microscope frame; NaN for an object without landmarks."""
         if not self.has_landmarks:
             return np.full((3, 3), np.nan)
         tips = [jaw.opened(side, pose.opening_mm)[-1] for jaw, side in zip(self.jaws, (1, -1), strict=True)]
         return pose.place(np.array([np.zeros(3), *tips]))
 
     def nodes(self, pose: Pose) -> Nodes:
-        """As `Forceps.nodes`; the chains of each other object have the next three numbers."""
+        """As `Forceps.nodes`; the chains of each further object have the next three numbers."""
         parts = [(3 * k + chain, *part) for k, one in enumerate([(self, pose), *self.others])
                  for chain, part in enumerate(one[0].parts(one[1]))]  # fmt: skip
         chains = np.concatenate([np.full(len(radii), chain) for chain, _, radii in parts])

@@ -1,4 +1,4 @@
-"""Light and what disturbs it beyond the reference microscope: lit discs, pupils, glare, shadows, haze, things in front."""
+"""Light and its disturbances beyond the reference microscope: lit discs, pupils, glare, shadows, haze, occluders."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import numpy as np
 from lib.simulator.forceps import Nodes
 from lib.simulator.window import Grid, Window
 
-_HALF_MM = 14.0  # of the square on which shadows fall
+_HALF_MM = 14.0  # half the side of the square in which shadows are computed
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class Patch:
 
     Attributes:
         radii_mm, turn_rad: Half axes, and the direction of the first.
-        role: "glare" adds light to the scene, behind the tool; "flare" adds it in front; "cover" hides what is behind;
-            "pupil" hides everything that is not in it.
+        role: "glare" adds light to the scene, behind the tool; "flare" adds it in front; "cover" hides what is behind it;
+            "pupil" hides everything outside it.
         edge, wobble: Width of its border, and amplitude of the border's irregularity, as shares of its radius.
     """
 
@@ -31,7 +31,7 @@ class Patch:
     wobble: float = 0.0
 
     def lay(self, linear: np.ndarray, window: Window) -> np.ndarray:
-        """Lay the patch over the image (h, w, 3) of a window, in place; (h, w) bool, where it hides what is behind."""
+        """Draw the patch over the image (h, w, 3) of a window, in place.  Returns a mask (h, w) of what it hides."""
         u = tuple(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in window.size_px)))
         x, y = window.rays(u, np.float32(self.centre_mm[2]))
         dx, dy = x - self.centre_mm[0], y - self.centre_mm[1]
@@ -54,16 +54,16 @@ class Patch:
 
 @dataclass(frozen=True)
 class Lighting:
-    """How a scene is lit, and what lies between it and the camera; the defaults are the reference microscope's light.
+    """The light on a scene, and what lies between scene and camera; the defaults are the reference microscope's light.
 
     Attributes:
         ambient, tool: Shares of the light that reach the scene outside the spot, and the tool.
         spot_edge: Border of a lit disc, as a share of `Microscope.spot_radius_mm`; None = a Gaussian spot of that radius.
-        band_rad: The spot is a band in this direction rather than a disc.
+        band_rad: Direction of the spot if it is a band; None = a disc.
         shadow, shadow_sigma_mm: Depth (0 to 1) and softness of the tool's shadow.
-        source_mm: A lamp near the scene casts the shadow; None = light from far, as `Microscope.light_slope` says.
+        source_mm: Position of a lamp near the scene that casts the shadow; None = distant light (`Microscope.light_slope`).
         scatter, haze: Share of the light that arrives blurred over `scatter_mm`, and light (3,) added everywhere.
-        tint_per_mm: (3, 2) relative change of each colour along x and y: lamps of two colours.
+        tint_per_mm: (3, 2) relative change of each colour per mm along x and y, as by lamps of two colours.
     """
 
     ambient: float = 0.25
@@ -80,7 +80,7 @@ class Lighting:
     tint_per_mm: tuple[tuple[float, float], ...] | None = None
 
     def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
-        """Light 0 to 1 at (x, y) mm of a scene, for a spot of this middle and radius."""
+        """Light, 0 to 1, at (x, y) mm of a scene, for a spot with this middle and radius."""
         x, y = x - middle_mm[0], y - middle_mm[1]
         turn = self.band_rad
         distance = (np.hypot(x, y) if turn is None else np.abs(y * np.cos(turn) - x * np.sin(turn))) / radius_mm
@@ -88,7 +88,7 @@ class Lighting:
         return self.ambient + (1 - self.ambient) * lit
 
     def shaded(self, at: tuple[np.ndarray, ...], nodes: Nodes, slope: tuple[float, float]) -> np.ndarray:
-        """Share of the light that a tool leaves on surface points at = (x, y, z)."""
+        """Share of the light that the tool's shadow leaves at surface points at = (x, y, z) mm."""
         (x, y, z), (centres, radii, chains) = at, nodes
         scale = 40.0 if self.shadow_sigma_mm < 0.1 else 20.0
         if self.source_mm is None:
@@ -111,13 +111,13 @@ class Lighting:
         return 1 - self.shadow / 255 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
     def behind(self, linear: np.ndarray, window: Window) -> None:
-        """Add to the scene (h, w, 3), in place, what lies behind the tool."""
+        """Draw what lies behind the tool on the scene (h, w, 3), in place."""
         for patch in self.patches:
             if patch.role == "glare":
                 patch.lay(linear, window)
 
     def in_front(self, linear: np.ndarray, window: Window, u: np.ndarray, visibility: np.ndarray) -> np.ndarray:
-        """Lay what lies before the tool over the image (h, w, 3), in place; the landmarks' visibility (3,) after that."""
+        """Draw what lies in front of the tool on the image (h, w, 3), in place.  Returns the new visibility (3,)."""
         if self.tint_per_mm is not None:
             grid = Grid(window.size_px, 8)
             x, y = window.rays(grid.u, np.zeros_like(grid.u[0]))

@@ -10,16 +10,16 @@ from lib.geometry import check
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
 
-#: Kinds of motion, and how long each takes by default.
+#: Kinds of motion, and the default duration of each.
 DURATIONS_S = {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}
 _CLEARANCE_MM = 0.12  # between a tip and the retina
-_DEPTHS_MM = (-1.5, -0.7, 0.1, 0.9)  # at which the tips sweep, z in the microscope frame
-_HALF_FIELD_MM = np.array([6.8, 3.4])  # of the area that the jaws' centre covers
+_DEPTHS_MM = (-1.5, -0.7, 0.1, 0.9)  # z of the tips during a sweep, in the microscope frame
+_HALF_FIELD_MM = np.array([6.8, 3.4])  # half width and half height of the area that the jaws' centre covers
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A smooth trajectory through random waypoints, the same for the same seed.
+    """A smooth trajectory through random waypoints, which depend on the seed.
 
     Attributes:
         kind: "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp,
@@ -42,9 +42,9 @@ class Motion:
 
     @cached_property
     def _parts(self) -> tuple[tuple[float, PchipInterpolator], ...]:
-        """(start, interpolator of (jaw centre x, y, tip z, azimuth, pitch, roll, opening)) in order of time."""
+        """(start, interpolator of (jaw centre x, y, tip z, azimuth, pitch, roll, opening)) of each part, in order of time."""
         rng = np.random.default_rng([self.seed, 23])
-        side = rng.uniform(-np.pi, np.pi)  # where the robot stands
+        side = rng.uniform(-np.pi, np.pi)  # mean azimuth of the tool, given by where the robot stands
         sweep_end, end = {"sweep": 1.0, "surgeon": 0.0, "both": 0.66}[self.kind] * self.duration_s, self.duration_s
         parts = [(0.0, sweep_end, *self._sweep(rng, side))] if sweep_end > 0 else []
         parts += [(sweep_end, end, *self._surgeon(rng, side))] if sweep_end < end else []
@@ -53,7 +53,7 @@ class Motion:
                      for share, (start, stop, points, _) in zip(shares, parts, strict=True))  # fmt: skip
 
     def _sweep(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], np.ndarray]:
-        """Waypoints, and how long the way from each to the next takes, of any unit."""
+        """Waypoints, and the relative durations between consecutive ones."""
         half_x, half_y = _HALF_FIELD_MM
         points = []
         for layer, z in enumerate(rng.permutation(_DEPTHS_MM)):
@@ -91,7 +91,7 @@ class Motion:
         return points, shares[1:]
 
     def pose(self, time_s: float) -> Pose:
-        """The pose at `time_s` from the start; the ends hold for times outside."""
+        """The pose at `time_s` from the start; times outside the motion get the pose at its start or end."""
         time = float(np.clip(time_s, 0, self.duration_s))
         start, path = [part for part in self._parts if part[0] <= time][-1]
         x, y, z, azimuth, pitch, roll, opening = path(time)

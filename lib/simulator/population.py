@@ -1,7 +1,7 @@
-"""Images for training, validation and tests: everything in them is drawn anew, from named families (`families.py`).
+"""Images for training, validation and tests, each drawn at random from named families (`families.py`).
 
-The narrow population, eyes and forceps of the reference rig, is a part of the training.  Test recordings use what is
-reserved for them, so no test frame shows an eye or a tool of the training.
+A part of the training images is from the narrow population, the eyes and forceps of the reference rig.  Some eyes and tools
+are reserved for test recordings, so no test frame shows an eye or a tool of the training.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,25 +23,25 @@ from lib.simulator.texture import Rng
 from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window
 
-#: Families from which the far rung draws what is not far.
+#: Families from which the populations of `FAR` draw the aspects that are not shifted.
 _ORDINARY = {"light": ("coaxial", "oblique", "near_lamp", "glare"), "optics": ("clean", "grey", "cast")}
-#: What `sample` draws from, beside the families of `FAR`.
+#: The populations from which `sample` draws, beside the families of `FAR`.
 POPULATIONS = ("training", "validation", "near", "empty")
 
-#: Eyes (and the textures and brush marks that go with them) that training never draws.
+#: Seeds of eyes, and of their textures and brush marks, that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
-#: Textures of eyes that train (few enough to stay in memory, each turned, tinted and shaped anew), validate and test.
+#: Seeds of textures for training (few enough to stay in memory; each eye rotates, tints and shapes them anew) and validation.
 TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS = range(10_000, 10_096), range(10_096, 10_112)
 _TEST_TEXTURE_SEEDS = range(9_000, 9_016)
-#: Jaw lengths that training never draws: recordings for tests have tools of these.
+#: Range of jaw lengths that training never draws; the tools of test recordings have such lengths.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
-_PHOTOGRAPHED = 0.4  # share of the scenes, but those of the reference rig, whose ground is a photograph if there are some
-_NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
+_PHOTOGRAPHED = 0.4  # if there are photographs: share of the scenes, except the reference rig's, with a photograph as ground
+_NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and number of its textures
 
 
 def random_forceps(rng: Rng, seed: int | None = None) -> Forceps:
-    """A design: jaws of 2 to 4 mm (not the reserved lengths), width, taper, arch, bend, hook and metal."""
+    """Draw a design: jaws of 2 to 4 mm (without the reserved lengths), width, taper, arch, bend, hook and metal."""
     low, high = RESERVED_JAW_MM
     length = rng.uniform(2.0, 4.0 - (high - low))
     return Forceps(
@@ -55,13 +55,13 @@ def random_forceps(rng: Rng, seed: int | None = None) -> Forceps:
 
 
 def reserved_forceps(rng: Rng, seed: int) -> Forceps:
-    """A design that training never draws; `seed`, one of `RESERVED_SEEDS`, makes its brush marks."""
+    """Draw a design that training never draws; `seed`, one of `RESERVED_SEEDS`, is that of its brush marks."""
     plain, own = random_forceps(rng, seed), {"jaw_length_mm": RESERVED_JAW_MM, "jaw_radius_mm": (0.10, 0.15)}
     return replace(plain, shaft_radius_mm=0.30, **drawn(rng, own | {"brightness": (0.45, 0.65)}))
 
 
 def random_pose(rng: Rng, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
-    """A pose whose jaws lie in the field, between the retina and 3 mm above it, the shaft coming from anywhere."""
+    """Draw a pose with the jaws in the field, between the retina and 3 mm above it, and the shaft from any direction."""
     azimuth, length = rng.uniform(-np.pi, np.pi), forceps.jaw_length_mm
     tips = _tips(rng, 1.03 if rng.random() < 0.1 else 0.93)
     pitch = rng.uniform(0.08, 0.75)
@@ -71,7 +71,7 @@ def random_pose(rng: Rng, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
 
 
 def _microscope(rng: Rng) -> Microscope:
-    """Light, optics and sensor of one image."""
+    """Draw light, optics and sensor of one image."""
     tint = np.exp(rng.normal(0, [0.16, 0.10, 0.20]))
     gain = tuple((tint / tint.mean()).tolist())
     return Microscope(
@@ -85,7 +85,7 @@ def _microscope(rng: Rng) -> Microscope:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What an image shows, through what, of which `families` (aspect -> name).  Without forceps a window looks at `pose`."""
+    """Content of an image, its microscope, and the `families` (aspect -> name).  Without forceps a window looks at `pose`."""
 
     scene: Eye
     forceps: Forceps | Instrument | None
@@ -95,7 +95,7 @@ class Setup:
 
 
 def _narrow_setup(rng: Rng, textures: Sequence[int], kind: type[Eye]) -> Setup:
-    """Eyes and forceps of the reference rig; the eye is an `Eye` or a `Ground`, with one of `textures`."""
+    """Draw an eye and a forceps of the reference rig; `kind` is `Eye` or `Ground`, `textures` are the texture seeds."""
     eye = kind(
         seed=int(textures[rng.integers(len(textures))]), texture_px=_TEXTURE_PX, depth_mm=rng.uniform(1.2, 3.2),
         fold_mm=rng.uniform(0.02, 0.18), tilt_rad=rng.uniform(0.0, 0.08), centre_z_mm=rng.uniform(0.4, 1.8),
@@ -110,15 +110,15 @@ def random_setup(
     rng: Rng, population: str = "training", *, textures: Sequence[int] | None = None, without: Sequence[str] = (),
     photographs: Sequence[Path] = (), centred: bool = False,
 ) -> Setup:  # fmt: skip
-    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field."""
+    """Draw the content of an image; see `sample` for the arguments.  `centred` puts tool and light in the field's centre."""
     choices = _choices(population, without)
     if textures is None:
         own = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
         textures = own.get(population, _TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
-        # The film of a `Ground` stays in memory.
+        # `Ground` has few different wet films, which stay in memory.
         return _narrow_setup(rng, textures[:_NARROW_TEXTURES], Eye if population == "near" else Ground)
-    if population == "validation":  # at least one aspect is of a family that training never draws
+    if population == "validation":  # at least one aspect has a family that training never draws
         shifted = rng.random(len(ASPECTS)) < 0.35
         shifted[rng.integers(len(ASPECTS))] = True
         choices |= {aspect: SHIFTED[aspect] for aspect, new in zip(ASPECTS, shifted, strict=True) if new}
@@ -144,19 +144,19 @@ def random_setup(
     if isinstance(tool, Instrument) and rng.random() < 0.3:
         tool = beside(rng, tool, size, np.array(pose.base_mm), surface_z_mm)
     middle = np.array(pose.base_mm) + 0.5 * length * pose.microscope_from_tool[:, 0]
-    # The exposure suits the scene more or less, as a camera's does.
+    # The exposure roughly suits the scene, as that of a camera.
     exposed = np.exp(rng.normal(-1.4, 0.55)) / (1.45 * np.mean((scene.texture[::16, ::16] / 255.0) ** 2.2) + 0.02)
     microscope = replace(_microscope(rng), brightness=float(np.clip(exposed, 0.1, 5.0)))
     microscope = members["light"](rng, microscope, middle, length, surface_z_mm)
     settings = members["optics"](rng)
-    if rng.random() < 0.35:  # two things are wrong with the camera
+    if rng.random() < 0.35:  # the camera has the faults of two families
         settings = choices["optics"][str(rng.choice(list(choices["optics"])))](rng) | settings
     microscope = replace(microscope, jpeg_quality=int(rng.integers(40, 98)), video=Video(**settings))
     return Setup(scene, tool, microscope, pose, names)
 
 
 def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Callable]]:
-    """Aspect -> families that a population draws, less those left out."""
+    """Aspect -> families from which a population draws, except those `without`."""
     if population not in (*POPULATIONS, *FAR):
         raise ValueError(f"population: one of {', '.join((*POPULATIONS, *FAR))}, got {population!r}.")
     if unknown := set(without) - {name for known in TRAINING.values() for name in known}:
@@ -164,14 +164,14 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
     choices = {aspect: {n: draw for n, draw in known.items() if n not in without} for aspect, known in TRAINING.items()}
     if empty := [aspect for aspect, known in choices.items() if not known]:
         raise ValueError(f"without: leaves no family of {', '.join(empty)}.")
-    if population in FAR:  # one thing, or all, is new; the rest is what a lab would call ordinary
+    if population in FAR:  # one aspect, or all, is new; the others are ordinary
         choices = {aspect: {n: draw for n, draw in known.items() if n in _ORDINARY.get(aspect, known)}
                    for aspect, known in choices.items()}  # fmt: skip
     return choices | {aspect: {population: draw} for aspect, draw in FAR.get(population, {}).items()}
 
 
 def _wide_pose(rng: Rng, length: float, surface_z_mm: float) -> Pose:
-    """As `random_pose`, with wider openings, steeper tools, and more of them partly outside the field."""
+    """As `random_pose`, but with wider openings, steeper tools, and more tools that are partly outside the field."""
     azimuth, pitch = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 1.0)
     tips = _tips(rng, 1.15 if rng.random() < 0.15 else 0.93)
     tip_z = max(surface_z_mm - rng.exponential(0.9), -2.5)
@@ -180,12 +180,12 @@ def _wide_pose(rng: Rng, length: float, surface_z_mm: float) -> Pose:
 
 
 def _tips(rng: Rng, reach: float) -> np.ndarray:
-    """Where the tips are, (2,) mm: anywhere in a field `reach` times as large, so that they fill it and not the base."""
+    """Draw the tips' position (2,) mm, uniform in a field `reach` times as large: the tips shall fill it, not the base."""
     return rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
 
 
 def _reaching(tips: np.ndarray, z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float) -> Pose:
-    """The pose in which a tool of this length has its tips there."""
+    """The pose in which a tool of this length has its tips at (`tips`, `z`) mm."""
     base = [*(tips - (length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)]))), z - length * np.sin(pitch)]
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
 
@@ -195,21 +195,21 @@ def sample(
     jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training", without: Sequence[str] = (),
     photographs: Sequence[Path] = (),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """One view, not a pair, with its landmarks; `rng` decides everything.
+    """Draw and render one view (not a stereo pair) with its landmarks; `rng` determines everything.
 
     Args:
-        crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.
-        size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
-        around, jitter: The landmark that a window holds, 0 base, 1 or 2 a tip, None = the jaws' centre; and how far it may
-            lie from the window's centre, as a share of the window's side.
-        textures: Seeds of the textures to draw from, kept in memory; None = those of the population.
-        population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
+        crop_px: Side of a square window of the full-resolution image, somewhere around the jaws.
+        size_px: (w, h) to which the whole field is shrunk.  Without either size the image is the full-HD field.
+        around, jitter: The landmark that a window contains: 0 base, 1 or 2 a tip, None = the landmarks' mean.  Its largest
+            distance from the window's centre along each axis, as a share of the window's side.
+        textures: Seeds from which the texture is drawn; textures are kept in memory.  None = those of the population.
+        population: "training"; "validation", with families beside those of training; "near", the reference rig's eyes and
             forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.
         without: Families of `TRAINING` to leave out.
         photographs: Image files, each of which may be the ground of a scene.
 
     Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside, NaN without the tool;
-        visibility (3,): 0 outside, 1 hidden, 2 visible.  A ValueError refuses two sizes, small ones, and unknown names.
+        visibility (3,): 0 outside, 1 hidden, 2 visible.  Raises ValueError for two sizes, small ones, or unknown names.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
@@ -255,12 +255,12 @@ def sample(
 
 
 def _distorted(image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strength: float) -> tuple[np.ndarray, ...]:
-    """An image through a lens with radial distortion, with its landmarks: `strength` is the relative change at the corner."""
+    """Distort an image and its landmarks radially, as a lens does; `strength` is the relative change at the corner."""
     size = np.array(image.shape[1::-1])
     centre, reach2 = (size - 1) / 2, float(((size / 2) ** 2).sum())
 
     def grow(radius2: np.ndarray) -> np.ndarray:
-        """Where a pixel comes from, relative to where it goes: never from outside the image."""
+        """Radius of a pixel's source divided by its own radius; the source never lies outside the image."""
         return (1 + strength / reach2 * radius2) / (1 + max(strength, 0.0))
 
     columns, rows = np.meshgrid(np.arange(size[0]) - centre[0], np.arange(size[1]) - centre[1])

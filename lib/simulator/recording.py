@@ -1,4 +1,4 @@
-"""Whole recordings with known truth, in the format of `lib.recordings`."""
+"""Whole simulated recordings with ground truth, in the format of `lib.recordings`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +22,7 @@ _GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one
 
 @dataclass(frozen=True)
 class Design:
-    """What a simulated recording shows, through what, and what robot and annotator report of it.
+    """The content of a simulated recording, its microscope, and the errors of robot and annotator.
 
     Attributes:
         eye, forceps: None = chosen by the recording's seed, from designs that no training sees.
@@ -50,11 +50,11 @@ def simulate(
     folder: str | Path, design: Design | None = None, seed: int = 0, n_frames: int = 40, *, name: str | None = None,
     description: str = "", progress: bool = True, overwrite: bool = False,
 ) -> Recording:  # fmt: skip
-    """Simulate a recording and write it to `folder`, which appears whole or not at all; the same arguments, the same files.
+    """Simulate a recording and write it to `folder`, which appears whole or not at all.  Equal arguments give equal files.
 
-    The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
+    The frames are spread over the motion: every k-th frame of the video is kept, with its time in frames.csv.
 
-    `name` and `description` are of recording.toml, None = the folder's name; `progress` is whether to show a bar.  A
+    `name` (None = the folder's name) and `description` are written to recording.toml; `progress` shows a bar.  Raises
     FileExistsError if the folder exists and `overwrite` is False.
 
     >>> import tempfile
@@ -110,7 +110,7 @@ def simulate(
 
 
 def _in_glint(view: View) -> np.ndarray:
-    """(3,) bool: whether a glint, or a highlight of the metal, lies within `_GLINT_REACH_PX` of a landmark in view."""
+    """(3,) bool: True if a glint, or a highlight of the metal, lies within `_GLINT_REACH_PX` of a landmark in view."""
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):
         column, row = (slice(max(c - _GLINT_REACH_PX, 0), c + _GLINT_REACH_PX + 1) for c in np.round(view.u[k]).astype(int))

@@ -1,4 +1,4 @@
-"""What one camera of the microscope sees of a scene and a tool, with the truth beside it.
+"""Renders the image of a scene and a tool by one camera of the microscope, with ground truth.
 
 All in linear light; the optics follow in the order of a microscope: defocus, motion blur, vignetting, sensor noise, gamma.
 """
@@ -23,12 +23,12 @@ _BUMP_MM, _BUMP_PX = 10.0, 1024
 
 
 class View(NamedTuple):
-    """One camera's image (h, w, 3) uint8 RGB and its truth.
+    """One camera's image (h, w, 3) uint8 RGB and its ground truth.
 
     Attributes:
-        u, visibility: Landmarks (3, 2) px as imaged, NaN without a tool; (3,) COCO: 0 outside, 1 hidden, 2 visible.
-        surface_mm: (h, w), the scene's z in the microscope frame, or None if not asked for.
-        tool_mask, glint_mask: (h, w) uint8: how much of the pixel the sharp tool covers, and whether a glint saturates it.
+        u, visibility: Landmarks (3, 2) px in the image, NaN without a tool; (3,) COCO: 0 outside, 1 hidden, 2 visible.
+        surface_mm: (h, w), the scene's z in the microscope frame, or None if not requested.
+        tool_mask, glint_mask: (h, w) uint8: the share of a pixel that the sharp tool covers; 255 where a glint saturates.
     """
 
     image: np.ndarray
@@ -51,14 +51,14 @@ def render_view(
     forceps: Forceps | None = None, pose: Pose | None = None, later: tuple[Pose, float] | None = None,
     rng: np.random.Generator | None = None, factor: int = 2, surface: bool = False,
 ) -> View:  # fmt: skip
-    """What a camera sees in a window of its image.
+    """Render a window of a camera's image.
 
     Args:
-        side: 0 left, 1 right: which colour gains apply.
-        forceps, pose, later: The tool at the time of the image, or None, and (pose, seconds later) for its motion.
-        rng: Draws the sensor noise; None renders without noise.
-        factor: Samples per pixel and axis of the tool's edges.
-        surface: Whether to return the depth of every pixel too.
+        side: 0 left, 1 right: determines the colour gains.
+        forceps, pose, later: The tool at the time of the image, or None; `later` is (pose, seconds later), for its motion.
+        rng: Draws the sensor noise; None = no noise.
+        factor: Samples per pixel and axis at the tool's edges.
+        surface: True = also return the scene's z at every pixel.
 
     >>> from lib.simulator import Eye
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
@@ -70,7 +70,7 @@ def render_view(
     x, y, z = intersect(scene, window, grid.u)
     has_tool = forceps is not None and pose is not None
 
-    # The slope and mostly the light vary smoothly: the coarse grid is enough.
+    # The slope, and usually the light, vary smoothly: the coarse grid is enough.
     eps = 1e-3
     slope_x = (scene.height(x + eps, y) - scene.height(x - eps, y)) / (2 * eps)
     slope_y = (scene.height(x, y + eps) - scene.height(x, y - eps)) / (2 * eps)
@@ -94,7 +94,7 @@ def render_view(
     linear *= light[..., None]
     glint_mask, tool_mask = np.zeros((2, *linear.shape[:2]), np.uint8)
     if scene.gloss > 0:
-        # A film mirrors the lamp where its normal halves the directions of light and view.
+        # A film mirrors the lamp where its normal bisects the directions of light and view.
         want_x, want_y = (np.array([light_x, light_y]) - window.R[2, :2] / window.R[2, 2]) / 2
         film_x, film_y = grid.full(-0.6 * slope_x + want_x), grid.full(-0.6 * slope_y + want_y)
         place = (axis * np.float32(_BUMP_PX / _BUMP_MM / to_texture) for axis in (map_x, map_y))
@@ -103,7 +103,7 @@ def render_view(
         film_x += bump[..., 0]
         film_y += bump[..., 1]
         mirror = film_x * film_x + film_y * film_y
-        # A narrow core that saturates in a broad sheen.
+        # A narrow core that saturates, in a broad sheen.
         sheen = cv2.exp(mirror * np.float32(-1 / (2 * 0.09**2)))
         mirror = np.float32(2.2) * cv2.exp(mirror * np.float32(-1 / (2 * 0.011**2)))
         mirror += np.float32(0.10) * sheen
@@ -140,9 +140,9 @@ def render_view(
 def render_pair(
     scene: Scene, microscope: Microscope, *, forceps: Forceps | None = None, pose: Pose | None = None, **options: object
 ) -> tuple[View, View]:
-    """The left and right view of one moment; arguments as for `render_view`.
+    """Render the left and right view at one time; arguments as for `render_view`.
 
-    A ValueError refuses a tool that is entirely outside the field of both cameras.
+    Raises ValueError if the tool is entirely outside the field of both cameras.
     """
     rig, size = microscope.rig(RigidTransform.identity()), microscope.image_size_px
     if forceps and pose and not any(inside(u, size).any() for u in rig.project(forceps.landmarks(pose))):

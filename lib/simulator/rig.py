@@ -25,16 +25,16 @@ class Microscope:
 
     Attributes:
         convergence_rad: Angle between the two viewing directions.
-        depth_of_field_mm: Range of depth around `focus_z_mm` of at most 1 px defocus (sd at 100 px per mm); infinity = sharp.
+        depth_of_field_mm: Range of z around `focus_z_mm` with a defocus (sd, at 100 px per mm) of at most 1 px; inf = sharp.
         psf_px: Standard deviation of the point spread in focus.
         exposure_s, readout_s: Exposure of a row, and the time from the first to the last row of a rolling shutter.
-        light_slope: Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
-        spot_mm, spot_radius_mm: Where the coaxial light is brightest, and its Gaussian radius.
+        light_slope: Obliqueness of the light (x, y): shift of a shadow on the retina, in mm per mm of height.
+        spot_mm, spot_radius_mm: Position where the coaxial light is brightest, and its Gaussian radius.
         brightness, vignetting, gain: Exposure (1 is good), relative loss at the corners, colour gains of each camera.
-        full_well, read_noise: Electrons at full scale (infinity switches noise off), and of the read noise.
-        jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
-        inverse_distance_per_mm: One over the working distance; 0 is affine.
-        lighting, video: Light, and camera electronics, beyond what is above; None = no electronics.
+        full_well, read_noise: Electrons at full scale (infinity switches noise off), and electrons of read noise.
+        jpeg_quality: Quality of stored images, 0 to 100; None = lossless.
+        inverse_distance_per_mm: One over the working distance; 0 = affine cameras.
+        lighting, video: Further properties of the light, and the camera electronics; None = no electronics.
     """
 
     pixels_per_mm: tuple[float, float] = (100.0, 98.0)
@@ -83,12 +83,12 @@ class Microscope:
         return StereoRig(*cameras).moved(robot_from_microscope)
 
     def defocus_px(self, z_mm: np.ndarray) -> np.ndarray:
-        """Standard deviation of the defocus at depth z, at 100 px per mm: 1 px at the ends of the depth of field."""
+        """Standard deviation in px of the defocus at depth z, at 100 px per mm: 1 at the ends of the depth of field."""
         return np.abs(np.asarray(z_mm) - self.focus_z_mm) / (self.depth_of_field_mm / 2)
 
 
 def reference_rig(*, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE, **geometry: object) -> StereoRig:
-    """The rig that the simulator models by default, 10 um a pixel; `geometry` are attributes of `Microscope` that differ.
+    """The rig that the simulator models by default, with 10 um per pixel; `geometry` are other attributes of `Microscope`.
 
     >>> bool(reference_rig().is_affine), bool(reference_rig(inverse_distance_per_mm=1 / 150).is_affine)
     (True, False)

@@ -1,6 +1,6 @@
-"""Procedural textures: a fundus with pigment, vessels, disc, macula and sclera; and patterns of many statistics.
+"""Procedural textures: a fundus with pigment, vessels, disc, macula and sclera; and patterns of many kinds.
 
-A texture is reflectance (n, n, 3) uint8 RGB with display gamma; rows and columns run along y and x of the microscope frame.
+A texture is a reflectance (n, n, 3) uint8 RGB with display gamma; rows and columns run along y and x of the microscope frame.
 """
 
 import math
@@ -12,11 +12,11 @@ import numpy as np
 
 from lib.recordings import read_image
 
-#: Side of the square of the eye that a texture covers.
+#: Side of the square that a texture covers on the eye.
 EXTENT_MM = 26.0
 #: Encoding of textures and camera images: value = linear ** (1 / GAMMA).
 GAMMA = 2.2
-_SIDE_PX = 768  # of a pattern
+_SIDE_PX = 768  # side of a pattern
 Rng = np.random.Generator
 
 # Linear reflectance (red, green, blue) of healthy, dark, pale and brown fundi; an eye mixes two of them.
@@ -38,7 +38,7 @@ def smooth_noise(rng: np.random.Generator, size_px: int, cells: int, octaves: in
 
 
 def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Centrelines (k, 2) mm and widths (k,) mm of one kind of vessel, grown outwards from the optic disc."""
+    """Centre lines (k, 2) mm and widths (k,) mm of one kind of vessel, grown outwards from the optic disc."""
     caliber = 0.17 if kind == "vein" else 0.125
     towards_centre = np.arctan2(-disc_mm[1], -disc_mm[0])
     branches, stack = [], []
@@ -71,7 +71,7 @@ def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> li
 
 
 def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: float = 1.0) -> np.ndarray:
-    """Optical density (size_px, size_px) of vessels in 0..1, of `share` of their width."""
+    """Optical density (size_px, size_px), 0 to 1, of vessels drawn with `share` of their width."""
     image, scale = np.zeros((size_px, size_px), np.uint8), size_px / EXTENT_MM
     for line, widths in branches:
         pixels = np.round(((line + EXTENT_MM / 2) * scale - 0.5) * 16).astype(np.int32).tolist()
@@ -133,7 +133,7 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
 
 @lru_cache(maxsize=64)
 def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
-    """Any photograph as a texture: its central square stretched over the retina."""
+    """Make a texture from any photograph: its central square, resized to `size_px`."""
     image = read_image(Path(path))
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
@@ -144,7 +144,7 @@ def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def pattern(kind: str, seed: int) -> np.ndarray:
-    """A texture (n, n) uint8 over the whole range."""
+    """Make a pattern (n, n) uint8 that covers the whole range of values."""
     value = _KINDS[kind](np.random.default_rng([seed, 13]))
     low, high = np.percentile(value[::4, ::4], [0.5, 99.5])
     return np.uint8(255 * np.clip((value - low) / max(high - low, 1e-6), 0, 1))
@@ -155,7 +155,7 @@ def _noise(rng: Rng, cells: int, octaves: int = 1, gain: float = 0.5) -> np.ndar
 
 
 def _soft(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Blurred, as shares of 255 if the image is uint8."""
+    """Blur an image; values of a uint8 image are divided by 255."""
     return cv2.GaussianBlur(image, (0, 0), sigma_px).astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
 
 
@@ -175,7 +175,7 @@ def _blood(rng: Rng) -> np.ndarray:
 
 
 def _lines(rng: Rng, n: int, width: tuple[float, float], turn: float, spread: float) -> np.ndarray:
-    """Curves, 0 to 1, of random widths; `turn` bends them, `spread` is how much their directions differ."""
+    """Curves, 0 to 1, of random widths; `turn` is the spread of their bends, `spread` that of their directions, in rad."""
     total, main = np.zeros((_SIDE_PX, _SIDE_PX), np.uint8), rng.uniform(0, np.pi)
     for _ in range(n):
         heading = main + rng.normal(0, spread) + np.cumsum(rng.normal(0, turn, 40))
@@ -193,7 +193,7 @@ def _vessels(rng: Rng) -> np.ndarray:
 
 
 def _cells(rng: Rng, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to the nearest of n points, in its standard deviations, and which point that is."""
+    """Distance to the nearest of n points, divided by its standard deviation, and the label of that point."""
     ground = np.full((_SIDE_PX, _SIDE_PX), 255, np.uint8)
     ground[tuple(rng.integers(0, _SIDE_PX, (2, n)))] = 0
     distance, label = cv2.distanceTransformWithLabels(ground, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
@@ -215,7 +215,7 @@ def _dots(rng: Rng) -> np.ndarray:
 
 
 def _stones(rng: Rng) -> np.ndarray:
-    """Pieces of one brightness each, with dark joints."""
+    """Cells of constant brightness, darker towards their borders."""
     distance, label = _cells(rng, int(rng.integers(100, 1500)))
     return _soft(rng.uniform(0, 1, int(label.max()) + 1).astype(np.float32)[label], 1.0) - 0.08 * distance
 

@@ -1,7 +1,7 @@
-"""The tool in an image: its depth and normals, what hides its landmarks, and its metal.
+"""The tool in an image: its depth and normals, the visibility of its landmarks, and its metal.
 
 A round cone is the convex hull of two balls.  In orthographic view its front along a ray is the minimum over s of the convex
-f(s) = z(s) - sqrt(Q(s)), Q(s) = r(s)^2 - |w - s c|^2, in closed form: no mesh is needed.  The shaft ends flat.
+f(s) = z(s) - sqrt(Q(s)), Q(s) = r(s)^2 - |w - s c|^2.  It has a closed form, so no mesh is needed.  The shaft ends flat.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from lib.simulator.window import Window, blur_by_depth, motion_blur
 
 
 class ToolRaster(NamedTuple):
-    """What a camera sees of the tool, on a grid `factor` times finer than the image, over a box of it.
+    """The visible surface of the tool, on a grid `factor` times finer than the image, over a box of it.
 
     Attributes:
-        origin_px: (x, y), the image pixel whose first sample is the raster's first.
+        origin_px: (x, y), the image pixel with the raster's first sample.
         factor: Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
-        depth_mm, part: (h, w) depth along the view, infinity without tool, and 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
-        hit: (rows, columns), (n,) each, of the samples with tool; the following are theirs.
-        normal, tangent, along_mm: (n, 3) in the camera frame, across and along the part, and (n,) the position along it.
+        depth_mm, part: (h, w) depth along the view, infinity without tool; and 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
+        hit: (rows, columns), (n,) each, of the samples with tool, to which the following belong.
+        normal, tangent, along_mm: Normal and direction of the part (n, 3) in the camera frame; position (n,) along the part.
     """
 
     origin_px: tuple[int, int]
@@ -41,7 +41,7 @@ def rasterise(
 ) -> ToolRaster | None:
     """Rasterise round cones, given as `Nodes` in the camera frame, for an image (w, h) whose pixel is `zoom` * (x, y) mm.
 
-    Consecutive nodes of a chain are joined; chain 0 ends flat.  None where nothing is in view.
+    Consecutive nodes of a chain are joined; chain 0 ends flat.  Returns None if nothing is in view.
     """
     pixel, reach = centres[:, :2] * zoom, radii * zoom + 1.5
     joined = np.flatnonzero(chains[1:] == chains[:-1])
@@ -63,7 +63,7 @@ def rasterise(
         A = dr * dr - c @ c
         if A > -1e-9:  # one ball hides the other
             continue
-        # Relative to the node and small, so single precision is exact to nanometres.
+        # Coordinates relative to the node are small, so single precision is exact to nanometres.
         wx = (((np.arange((hx - lx) * factor) + 0.5) / factor - 0.5 + lx) / zoom - a[0]).astype(np.float32)
         wy = (((np.arange((hy - ly) * factor) + 0.5) / factor - 0.5 + ly) / zoom - a[1]).astype(np.float32)
         A, gain = np.float32(A), np.float32(dz / np.sqrt(dz * dz - A))
@@ -93,12 +93,12 @@ def rasterise(
 
 
 class ToolInView(NamedTuple):
-    """The tool in a window, each point when its own row is exposed.
+    """The tool in a window, with each point at the time when its own row is exposed.
 
     Attributes:
-        u, visibility: Landmarks (3, 2) px, and (3,) COCO: 0 outside the window, 1 hidden by another part, 2 visible.
-        velocity: (2,) mm/s of the tips in the image plane.
-        raster: None where nothing is in view.
+        u, visibility: Landmarks (3, 2) px, and (3,) COCO: 0 outside the window, 1 hidden by the tool itself, 2 visible.
+        velocity: (2,) mm/s, mean of the tips in the image plane.
+        raster: None if nothing is in view.
     """
 
     u: np.ndarray
@@ -111,9 +111,9 @@ def tool_in_view(
     window: Window, forceps: Forceps | Instrument, pose: Pose, later: tuple[Pose, float] | None, *,
     readout_s: float = 0.0, factor: int = 2,
 ) -> ToolInView:  # fmt: skip
-    """The tool as the window's camera sees it; `pose` holds when the middle row of the whole image is exposed.
+    """Project and rasterise the tool in a window; `pose` is that when the middle row of the whole image is exposed.
 
-    `later` (pose, seconds later) is its motion while the rows are read out, in `readout_s` for the whole image.
+    `later`, (pose, seconds later), gives its motion while the rows of the whole image are read out, within `readout_s`.
     """
     centres, radii, chains = forceps.nodes(pose)
     points = np.vstack([forceps.landmarks(pose), centres])
@@ -129,7 +129,7 @@ def tool_in_view(
     raster = rasterise(*nodes, zoom=window.zoom, size_px=window.size_px, factor=factor)
     u = landmarks[:, :2] * window.zoom
     visibility = np.where(inside(u, window.size_px), 2, 0)
-    # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
+    # A blunt jaw's tip lies inside its own outline unless the jaw is parallel to the image, so only pointed jaws are tested.
     pointed = forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
     for k in np.flatnonzero(visibility) if raster else ():
         hidden = _behind_another_part(raster, k, u[k], landmarks[k, 2] - (forceps.shaft_radius_mm if k == 0 else 0.0))
@@ -139,7 +139,7 @@ def tool_in_view(
 
 
 def _behind_another_part(raster: ToolRaster, k: int, u: np.ndarray, front_mm: float) -> bool:
-    """Whether something lies before landmark k at pixel u, whose own part begins at this depth."""
+    """True if another part lies in front of landmark k at pixel u, whose own part begins at depth `front_mm`."""
     column, row = np.floor((u + 0.5 - raster.origin_px) * raster.factor).astype(int)
     if not (0 <= row < raster.part.shape[0] and 0 <= column < raster.part.shape[1]):
         return False
@@ -147,7 +147,7 @@ def _behind_another_part(raster: ToolRaster, k: int, u: np.ndarray, front_mm: fl
 
 
 def _behind_its_jaw(nodes: Nodes, k: int, u: np.ndarray, zoom: float) -> bool:
-    """Whether a blunt jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
+    """True if a jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
     factor, reach_px, side = 16, 0.25, 5
     corner = np.round(u) - 2
     centres, radii, chains = (part[nodes[2] == k] for part in nodes)
@@ -164,9 +164,9 @@ def compose(
     linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, forceps: Forceps | Instrument, window: Window,
     microscope: Microscope, light: tuple[float, float], scene_z_mm: float,
 ) -> None:  # fmt: skip
-    """Lay the tool, blurred by its depth and motion, over the scene: `linear` (h, w, 3) and `tool_mask` change in place.
+    """Draw the tool, blurred by its depth and motion, over the scene; changes `linear` (h, w, 3) and `tool_mask` in place.
 
-    `light` is the lamp's direction (x, y) per unit of height, in the microscope frame, `scene_z_mm` the scene's mean depth.
+    `light` is the lamp's direction (x, y) per unit of height, in the microscope frame; `scene_z_mm` the scene's mean z.
     """
     raster = tool.raster
     lamp = np.array([*light, -1.0]) @ window.R.T
@@ -183,10 +183,10 @@ def compose(
     (x0, y0), margin = raster.origin_px, 12 + int(np.ceil(np.abs(shift).max()))
     tool_mask[y0 : y0 + height, x0 : x0 + width] = np.round(255 * alpha)
     layer = np.dstack([colour, alpha])
-    # Beyond the image's border the tool goes on; elsewhere there is nothing beyond the layer.
+    # At the image's border the tool continues outside, so there is no margin; elsewhere nothing lies outside the layer.
     pad = np.minimum(margin, [y0, linear.shape[0] - y0 - height, x0, linear.shape[1] - x0 - width]).tolist()
     layer = cv2.copyMakeBorder(layer, *pad, cv2.BORDER_CONSTANT, value=0)
-    # Depth along the axis is z of the microscope frame to a few um; around the tool it is that of the tool near by.
+    # The depth along the view equals z of the microscope frame to a few um.  Around the tool, use that of the tool near by.
     covered = alpha > 0.01
     spread = cv2.blur(np.where(covered, depth, 0), (25, 25)) / np.maximum(cv2.blur(np.float32(covered), (25, 25)), 1e-3)
     sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(np.where(covered, depth, spread)))
@@ -198,7 +198,7 @@ def compose(
 
 
 def _brush_marks(seed: int, n: int, sigma: float) -> np.ndarray:
-    """Marks (n, 128) of unit variance along a part: rows run around it."""
+    """Marks (n, 128) of unit variance: columns run along a part, rows around it."""
     marks = np.random.default_rng([seed, 3]).standard_normal((n, 128)).astype(np.float32)
     marks = cv2.GaussianBlur(marks, (0, 0), sigmaX=sigma, sigmaY=0.8)
     return marks / marks.std()
@@ -208,7 +208,7 @@ def _metal(raster: ToolRaster, forceps: Forceps, lamp: np.ndarray, glow: np.ndar
     """Linear colour (n, 3) of the raster's tool samples under the lamp (3,), with the retina's glow (3,) from below."""
     normal, tangent = raster.normal, raster.tangent
     facing = np.clip(-normal[:, 2], 0, 1)
-    up = 2 * facing * facing - 1  # of the mirrored view ray: 1 looks back into the microscope, -1 at the retina
+    up = 2 * facing * facing - 1  # of the reflected view ray: 1 towards the microscope, -1 towards the retina
     half = lamp - [0, 0, 1.0]
     half = (half / np.linalg.norm(half)).astype(np.float32)
     along = tangent @ half
@@ -224,7 +224,7 @@ def _metal(raster: ToolRaster, forceps: Forceps, lamp: np.ndarray, glow: np.ndar
 
 
 def _at_image_resolution(raster: ToolRaster, metal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Premultiplied colour (h, w, 3), coverage (h, w) and mean depth (h, w) of the tool's samples."""
+    """Average the tool's samples to premultiplied colour (h, w, 3), coverage (h, w) and mean depth (h, w) of the pixels."""
     rows, columns = raster.hit
     height, width = (side // raster.factor for side in raster.part.shape)
     pixel = (rows // raster.factor) * width + columns // raster.factor
@@ -238,7 +238,7 @@ def _at_image_resolution(raster: ToolRaster, metal: np.ndarray) -> tuple[np.ndar
 
 
 def _finished(raster: ToolRaster, tool: Instrument, lamp: np.ndarray, scene: np.ndarray, clearance_px: float) -> np.ndarray:
-    """As `_metal`, for any finish, with `scene` (h, w, 3), `clearance_px` below the tool, mirrored in it."""
+    """As `_metal`, for any finish, which mirrors the `scene` (h, w, 3) that lies `clearance_px` below the tool."""
     normal, tangent = raster.normal, raster.tangent
     chain = raster.part[raster.hit].astype(int) - 1
     finishes = [f for one in (tool, *(other for other, _ in tool.others)) for f in (one.finishes[0], *[one.finishes[1]] * 2)]
@@ -250,7 +250,7 @@ def _finished(raster: ToolRaster, tool: Instrument, lamp: np.ndarray, scene: np.
     half /= np.linalg.norm(half)
     to_half, along = np.clip(normal @ half, 0, 1), tangent @ half
     streak = np.maximum(1 - along * along, 0) ** sharpness * to_half**4
-    # The view ray (0, 0, 1), mirrored: where it goes down it meets the scene, where it goes up the room and the lamp.
+    # The reflected view ray (0, 0, 1) meets the scene if it goes down, and the room and the lamp if it goes up.
     up = 2 * normal[:, 2] ** 2 - 1
     shift = -2 * normal[:, 2:] * normal[:, :2] * (clearance_px / np.maximum(-up, 0.15))[:, None]
     sky = 0.08 + 0.75 / (1 + np.exp(-(up - 0.6) / 0.12))

@@ -1,4 +1,4 @@
-"""What a camera's electronics and its recorder do to an image: blur, colour, sharpening, noise, fields, compression."""
+"""Effects of a simple lens, of camera electronics and of a recorder: blur, colours, noise, sharpening, compression."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -11,19 +11,19 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class Video:
-    """Applied to the finished image in this order; the defaults do nothing.  Lengths are px of the image.
+    """Effects on the finished image; the defaults change nothing.  Lengths are in px of the image.
 
     Attributes:
         defocus_px, astigmatism: Radius of the disc into which each point is blurred, and its stretch along the rows.
-        fringe_px: Distance by which red and blue part from green, to opposite sides.
-        colours: (3, 3) output from input colours: casts, permutations, grey.
+        fringe_px: Shift of red and blue against green, to opposite sides.
+        colours: (3, 3) matrix from input to output colours: casts, permutations, grey.
         contrast, black, gamma: Tone curve: black + (1 - black) * contrast * value ** gamma, clipped.
         sharpening, sharpening_px: Strength and width of unsharp masking.
         noise, noise_px, noise_grey: Standard deviation (share of full scale), correlation length, share common to colours.
-        banding: Standard deviation of a brightness error that differs by row.
+        banding: Standard deviation of a brightness error that is constant in a row.
         field_shift_px: Shift along x between odd and even rows.
-        resample, chroma: The image, and its colours, were stored this many times smaller.
-        mosaic, quality: One colour a pixel, interpolated; and of a JPEG compression, 100 is none.
+        resample, chroma: Factors by which the image, and its colours, are shrunk for storage.
+        mosaic, quality: True = one colour per pixel, interpolated; quality of the JPEG compression, 100 = none.
     """
 
     defocus_px: float = 0.0
@@ -46,7 +46,7 @@ class Video:
     quality: float = 100
 
     def __call__(self, image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-        """The image (h, w, 3) uint8 RGB as recorded; without `rng` it has no noise."""
+        """Apply the effects to an image (h, w, 3) uint8 RGB; without `rng` there is no noise and no banding."""
         height, width = image.shape[:2]
         if self.resample != 1.0:
             size = max(round(width / self.resample), 16), max(round(height / self.resample), 16)
@@ -91,22 +91,22 @@ class Video:
         return image if self.resample == 1.0 else cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
 
     def shrunk(self, factor: float) -> Self:
-        """For an image of which every length is `factor` times as long; compression and noise stay."""
+        """The effects for an image scaled by `factor`: defocus, fringes and field shift are scaled, the rest stays."""
         return replace(self, **{name: factor * getattr(self, name) for name in ("defocus_px", "fringe_px", "field_shift_px")})
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """The image after a JPEG file."""
+    """Compress an image as JPEG and decode it."""
     return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
 
 
 def _shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """The image moved by (x, y) px."""
+    """Shift an image by (x, y) px."""
     return cv2.warpAffine(image, np.float32([[1, 0, x], [0, 1, y]]), image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
 
 
 def _disc_blur(value: np.ndarray, radius: float, stretch: float) -> np.ndarray:
-    """The image with each point spread over a soft ellipse; wide ones at a lower resolution."""
+    """Blur an image by a soft ellipse; a wide one is applied at a lower resolution."""
     step = 1 << int(np.clip(np.log2(radius / 3.0), 0, 4))
     height, width = value.shape[:2]
     small = cv2.resize(value, (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA) if step > 1 else value

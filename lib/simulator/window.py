@@ -1,6 +1,6 @@
-"""A window of a camera's image: the rays of its pixels, the smooth height field that they meet, and blur.
+"""A window of a camera's image: the rays of its pixels, their intersections with a smooth height field, and blur.
 
-Rays meet the scene after a few fixed-point steps, on a coarse grid of pixels; the rest is interpolated.
+The intersections are found by a few fixed-point steps on a coarse grid of pixels, and interpolated for the others.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,10 +18,10 @@ _Camera = AffineCamera | NearAffineCamera
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The part of a camera's image that is rendered: `camera` maps the microscope frame to its pixels, which are square.
+    """The part of a camera's image that is rendered; `camera` maps the microscope frame to the window's square pixels.
 
-    `field_px` is the size (w, h) of the whole image (None = the window's), and `origin_px` the window's first pixel in it.
-    `R` is the rotation (3, 3) camera_from_microscope, whose third row is the viewing direction, and `zoom` px per mm.
+    `field_px` is the size (w, h) of the whole image (None = the window's), `origin_px` the window's first pixel in it.
+    `R` is the rotation (3, 3) camera_from_microscope, whose third row is the viewing direction; `zoom` is px per mm.
     """
 
     camera: _Camera
@@ -42,7 +42,7 @@ class Window:
     def around(
         cls, camera: _Camera, u: np.ndarray, size_px: tuple[int, int], field_px: tuple[int, int] | None = None
     ) -> Self:
-        """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
+        """Make the window of `size_px` around pixel `u` (2,) of a camera whose whole image has the size `field_px`."""
         origin = np.round(np.asarray(u) - np.array(size_px) / 2)
         moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}
         if isinstance(camera, NearAffineCamera):
@@ -50,7 +50,7 @@ class Window:
         return cls(replace(camera, **moved), size_px, field_px, tuple(origin))
 
     def seen(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (n, 3) mm in the camera frame, and the scale (n,) by which perspective shrinks lengths there.
+        """Transform points (n, 3) mm to the camera frame; also returns the perspective scale (n,) of lengths there.
 
         In the camera frame pixel = zoom * (x, y), and z is the depth along the viewing direction.
         """
@@ -59,9 +59,9 @@ class Window:
         return np.column_stack([homogeneous[:, :2] * (shrink / self.zoom)[:, None], x @ self.R[2]]), shrink
 
     def rays(self, u: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(x, y) mm where the rays of pixels u meet depth z of the microscope frame; all of one shape."""
+        """(x, y) mm where the rays of pixels u reach z of the microscope frame; all arrays have one shape."""
         *rows, last = self.camera.projection_matrix
-        # (row - u * last) @ [x, y, z, 1] = 0; zeros, all but one of an affine camera, cost nothing.
+        # (row - u * last) @ [x, y, z, 1] = 0.  Zeros in the last row are skipped: an affine camera has three.
         equations = ([m - u[k] * n if n else m for m, n in zip(row, last, strict=True)] for k, row in enumerate(rows))
         (a, b, c, s), (d, e, f, t) = equations
         right, determinant = (-s - c * z, -t - f * z), a * e - b * d
@@ -69,7 +69,7 @@ class Window:
 
 
 def intersect(scene: Scene, window: Window, u: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
-    """(x, y, z) mm of the scene at pixels u = (columns, rows).  On an eye each step divides the error by about 30."""
+    """Points (x, y, z) mm of the scene at pixels u = (columns, rows).  On an eye each step divides the error by about 30."""
     z = np.zeros_like(u[0])
     for _ in range(40):
         before, z = z, scene.height(*window.rays(u, z))
@@ -80,7 +80,7 @@ def intersect(scene: Scene, window: Window, u: tuple[np.ndarray, np.ndarray]) ->
 
 @lru_cache(maxsize=8)
 def _interpolation(size: int, step: int) -> np.ndarray:
-    """(size, n) weights of the cubic through four neighbours on the coarse grid -step, 0, step, ..."""
+    """Weights (size, n) of cubic interpolation from four neighbours on the coarse grid -step, 0, step, ..."""
     n = size // step + 4
     position = np.arange(size) / step + 1
     first = np.clip(np.floor(position).astype(int) - 1, 0, n - 4)
@@ -92,14 +92,14 @@ def _interpolation(size: int, step: int) -> np.ndarray:
 
 
 class Grid:
-    """The coarse grid of an image (`u`, its pixels) and the way back to full resolution (`full`)."""
+    """A coarse grid of an image: `u` are the pixels of its nodes, `full` interpolates to full resolution."""
 
     def __init__(self, size_px: tuple[int, int], step: int) -> None:
         self.columns, self.rows = (_interpolation(side, step) for side in size_px)
         self.u = np.meshgrid(*((np.arange(weights.shape[1]) - 1.0) * step for weights in (self.columns, self.rows)))
 
     def full(self, values: np.ndarray) -> np.ndarray:
-        """(h, w) float32 from values on the coarse grid; exact to 1e-6 of a value of order one."""
+        """Interpolate values on the coarse grid to (h, w) float32; rounding errors are 1e-6 for values of order one."""
         offset = float(values.mean())
         return self.rows @ ((values - offset).astype(np.float32) @ self.columns.T) + np.float32(offset)
 
@@ -107,21 +107,21 @@ class Grid:
 def surface_grid(
     scene: Scene, camera: _Camera, size_px: tuple[int, int], step_px: int = 8
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The true surface: columns (a,) px, rows (b,) px and the points (b, a, 3) mm, microscope frame, seen there.
+    """The true surface: columns (a,) px, rows (b,) px, and the points (b, a, 3) mm there, in the microscope frame.
 
-    Linear interpolation between the points is right to 1 um for eyes at the default step.
+    For eyes, at the default step, linear interpolation between the points is exact to 1 um.
     """
     x_px, y_px = (np.append(np.arange(0, side - 1, step_px), side - 1).astype(float) for side in size_px)
     return x_px, y_px, np.stack(intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px))), axis=-1)
 
 
 def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Gaussian blur; a width too small to see leaves the image as it is."""
+    """Gaussian blur; a width too small to see leaves the image unchanged."""
     return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.15 else image
 
 
 def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = None) -> np.ndarray:
-    """Gaussian blur of slowly varying width, given on `grid` or for every pixel: a blend of up to three, by variance."""
+    """Gaussian blur of slowly varying width, given on `grid` or for every pixel: blends up to three blurs, by variance."""
     low, high = float(sigma_px.min()), float(sigma_px.max())
     if high - low < 0.15:
         return blur(image, (low + high) / 2)
@@ -135,7 +135,7 @@ def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = N
 
 
 def motion_blur(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
-    """Centred blur along the movement (2,) px during the exposure; one too short to see leaves the image as it is."""
+    """Centred blur along the motion (2,) px during the exposure; one too short to see leaves the image unchanged."""
     if (length := float(np.hypot(*shift_px))) < 0.3:
         return image
     half = int(np.ceil(length / 2)) + 1

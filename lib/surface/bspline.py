@@ -1,4 +1,4 @@
-"""Surfaces R^2 -> R^3 as bicubic B-splines: position, uncertainty, distance of a tool, and their robust fit (Sec. IV-B).
+"""Surfaces R^2 -> R^3 as bicubic B-splines: position, uncertainty, distance to a tool, and their robust fit (Sec. IV-B).
 
 The parameter is the left image point u = (x, y) px.
 """
@@ -18,36 +18,36 @@ from lib.geometry import finite_points, points, store_array
 from lib.surface.grid import SplineGrid
 from lib.surface.solver import UNHELD, L1Problem, L1Solution, cholesky, interior_point
 
-#: Default rejection: L1 norms above this many times the median.  Of Gaussian noise along one axis 0.1 % lies beyond.
+#: Default rejection: L1 norms above this many times the median, which 0.1 % of Gaussian residuals along one axis exceed.
 REJECT_MEDIANS = 5.0
 _FOLDS = 3
-_ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # points in the folds that are tried: more only cost time
-_LADDER = 10.0**0.5  # step between candidates of the smoothness
-_EXTENT = 8  # at most so many steps from the first candidate, either way
+_ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # held-out points that suffice to choose the smoothness
+_LADDER = 10.0**0.5  # ratio of neighbouring candidates of the smoothness
+_EXTENT = 8  # largest number of steps from the first candidate, up or down
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """How a surface was found; from `problem` on what was solved last, over the inliers."""
+    """Results of a fit.  The attributes from `problem` on belong to the last fit, to the inliers."""
 
-    objective: float  # Eq. (6) over the final inliers; with point covariances the norms are whitened, with a camera depths
-    duality_gap: float  # proven bound, in the unit of the objective, on its distance from the minimum
+    objective: float  # Eq. (6) over the final inliers; norms are whitened with point covariances, and depths with a camera
+    duality_gap: float  # upper bound on objective - minimum, in the unit of the objective
     smoothness: float  # mu of Eq. (6), px^2 / mm: given, or chosen by held-out error
-    reject_mm: float  # bound on the L1 norm of a point's residual that was applied, after the first fit
-    inliers: np.ndarray  # (n,) points that the final fit used
+    reject_mm: float  # bound on the L1 norm of a point's residual, applied after the first fit
+    inliers: np.ndarray  # (n,) bool: points that the final fit used
     held_out: np.ndarray  # (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) if it was given
     axes: np.ndarray  # (k, 3) orthonormal directions along which the L1 norm was taken; the frame's axes for the plain fit
-    problem: L1Problem = field(repr=False)  # the points on their grid
-    penalty: np.ndarray = field(repr=False)  # mu (k,) of each output along `axes`
-    weights: np.ndarray = field(repr=False)  # factors (n, k) of the absolute residuals
+    problem: L1Problem = field(repr=False)  # the inliers and their grid
+    penalty: np.ndarray = field(repr=False)  # (k,) mu of each output along `axes`
+    weights: np.ndarray = field(repr=False)  # (n, k) factors on the absolute residuals
     residual: np.ndarray = field(repr=False)  # (n, k)
 
     @cached_property
     def posterior(self) -> list[tuple[np.ndarray, float]]:
-        """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
+        """For each output, the Cholesky factor of 2 f B'W^2 B + 2 mu R and the density f of the residuals at zero."""
         posterior = []
         for mu, weights, size in zip(self.penalty, self.weights.T, np.abs(self.weights * self.residual).T, strict=True):
-            # The surface meets some points exactly; only the others show the scatter, half of them within their median.
+            # The surface interpolates some points exactly.  Half of the others are within their median: f = 0.5 / (2 median).
             free = size[size > 1e-3 * size.mean()]
             density = 0.25 / max(np.median(free), np.finfo(float).tiny) if len(free) else np.inf
             factor = cholesky(self.problem.normal_band(2 * density * weights**2, 2 * mu))
@@ -58,12 +58,12 @@ class SurfaceFit:
 
     @cached_property
     def agreement(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of residual signs: variance (k,) of sums in a quarter cell over that of independent ones; correlation (k, k)."""
+        """Of residual signs: variance (k,) of their sums over quarter cells, 1 = independent; correlation (k, k)."""
         signs, grid = np.sign(self.residual), self.problem.grid
         cell, t = grid.locate(self.problem.u)
         quarter = (2 * cell + (t >= 0.5)) @ (1, 2 * grid.cells[0])
-        _, place, counts = np.unique(quarter, return_inverse=True, return_counts=True)
-        sums = np.stack([np.bincount(place, column) for column in signs.T], axis=1)
+        _, group, counts = np.unique(quarter, return_inverse=True, return_counts=True)
+        sums = np.stack([np.bincount(group, column) for column in signs.T], axis=1)
         norm = np.sqrt(np.maximum((signs**2).sum(axis=0), 1.0))
         correlation = signs.T @ signs / np.outer(norm, norm)
         np.fill_diagonal(correlation, 1.0)
@@ -74,8 +74,8 @@ class SurfaceFit:
 class ToolDistance:
     """Distance of points to a surface; positive on the camera's side of it, NaN outside the domain.
 
-    `along_view_mm` (n,) is to the surface point that the camera sees behind the tool, `along_normal_mm` (n,) to the nearest
-    one, which is `nearest_mm` (n, 3) with the parameter `nearest_u` (n, 2); NaN where that lies beyond the domain's border.
+    `along_view_mm` (n,) is the distance to the surface point at the same left pixel.  `along_normal_mm` (n,) is the distance
+    to the nearest point `nearest_mm` (n, 3) at the parameter `nearest_u` (n, 2); NaN if that is beyond the domain's border.
     """
 
     along_view_mm: np.ndarray
@@ -88,7 +88,7 @@ class ToolDistance:
 class BSplineSurface:
     """x = Psi(u), a bicubic B-spline from left image points (px) to points (mm, the frame of the fitted points).
 
-    `grid` is its domain, with `control_points_mm` (n_y, n_x, 3); `fit` is how it was found, None where it was not fitted.
+    `grid` is the domain and the layout of `control_points_mm` (n_y, n_x, 3); `fit` is None if the surface was not fitted.
     """
 
     grid: SplineGrid
@@ -121,7 +121,7 @@ class BSplineSurface:
         return result
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
-        """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
+        """Points (len(y), len(x), 3) at the columns `x_px` and the rows `y_px`: fast for whole images."""
         values = self.control_points_mm
         for axis, u in ((1, x_px), (0, y_px)):
             u, low, high = np.asarray(u, dtype=np.float64), self.grid.domain[1 - axis], self.grid.domain[3 - axis]
@@ -140,8 +140,8 @@ class BSplineSurface:
 
         With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
         C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
-        Neighbouring matches share part of their error, so C is inflated by how much the signs of their residuals agree, and
-        outputs correlate as signs do.  What all points share, such as the error of the calibration, is not in it.
+        Errors of neighbouring matches are correlated, so C is inflated by the correlation of the signs of their residuals;
+        the outputs are correlated as these signs are.  Common errors of all points, such as the calibration's, are left out.
         """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
@@ -156,7 +156,7 @@ class BSplineSurface:
 
     @cached_property
     def _lattice(self) -> tuple[np.ndarray, KDTree]:
-        """Image points (m, 2), three a cell, and a search tree of the surface there; its nearest is in the right valley."""
+        """Image points (m, 2), 3 x 3 in each cell, and a search tree of the surface there: initial values for `distance`."""
         low, high = np.reshape(self.grid.domain, (2, 2))
         x, y = (np.linspace(*ends) for ends in zip(low, high, 3 * np.array(self.grid.cells) + 1, strict=True))
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), KDTree(self.on_grid(x, y).reshape(-1, 3))
@@ -164,7 +164,7 @@ class BSplineSurface:
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
         """Distance of points (n, 3), such as tool tips, to the surface along the view and along the surface's normal.
 
-        The points are in the frame of the surface, NaN rows stay NaN; `camera` is the left one, whose image parametrises it.
+        The points are in the frame of the surface; NaN rows stay NaN.  `camera` is the left one, whose image is the domain.
         """
         x = points(x_mm, 3, "x_mm")
         behind = camera.project(x)
@@ -179,7 +179,7 @@ class BSplineSurface:
             jacobian = np.stack([psi_x, psi_y], axis=2)
             gap = x[seen] - psi
             normal = np.einsum("nki,nkj->nij", jacobian, jacobian)
-            # Second-order term of the distance: keeps steps right where the tool is far above a curved surface.
+            # The second-order term makes the steps accurate where the tool is far above a curved surface.
             hessian = normal - np.einsum("ijnk,nk->nij", [[psi_xx, psi_xy], [psi_xy, psi_yy]], gap)
             convex = (np.linalg.det(hessian) > 0) & (hessian[:, 0, 0] > 0)
             hessian[~convex] = normal[~convex]
@@ -187,7 +187,7 @@ class BSplineSurface:
             before, u[seen] = u[seen], np.clip(u[seen] + step, low, high)
             if np.abs(u[seen] - before).max(initial=0.0) < 1e-7:
                 break
-        # At the domain's border the nearest point may lie beyond it: then there is none to name.
+        # Where the last step was clipped, the nearest point is beyond the domain's border and unknown.
         u[seen] = np.where((np.abs(before + step - u[seen]) < 1e-6).all(axis=1, keepdims=True), u[seen], np.nan)
         nearest = self(u)
         return ToolDistance(along_view, np.einsum("nk,nk->n", x - nearest, self.normal(u)), nearest, u)
@@ -200,7 +200,7 @@ def fit_surface(
 ) -> BSplineSurface:  # fmt: skip
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
 
-    Points whose L1 norm exceeds `reject_mm` at this surface are dropped and it is fitted once more, as in the paper.
+    Points whose L1 norm exceeds `reject_mm` at this surface are dropped, and the fit is repeated once, as in the paper.
 
     Args:
         u: (n, 2) left image points, px.  Points outside the domain are not used.
@@ -209,16 +209,16 @@ def fit_surface(
         control: (n_x, n_y) control points.
         smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points, whatever their order.
         reject_mm: Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the
-            first fit, or as much as leaves points enough to fit; infinity keeps all.
+            first fit, or more if too few points would remain; infinity keeps all.
         covariance_mm2: Covariance of the points, (3, 3) or (n, 3, 3).  Residuals are then taken along the principal axes of
-            their mean and divided by their own standard deviations (times the mean: in mm).  None is the paper's plain norm.
+            its mean and weighted by 1 / standard deviation, with a mean weight of 1.  None is the paper's plain norm.
         camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
             s along the viewing direction d is fitted, to d.x.  Give `u` as matched in the image.
-        solver: Takes the place of `lib.surface.solver.interior_point`, for comparisons.
-        quick: Five Newton steps, some percent off the minimum, choose smoothness and inliers, and the final fit stops at a
-            duality gap of 1e-4 of the objective; else it stops at 1e-8.
+        solver: Replaces `lib.surface.solver.interior_point`, for comparisons.
+        quick: Smoothness and inliers are chosen with five Newton steps, some percent above the minimum, and the final fit
+            stops at a duality gap of 1e-4 of the objective; else it stops at 1e-8.
 
-    A ValueError refuses NaN and points that determine no surface: fewer in the domain than 16 or a quarter of control points.
+    A ValueError refuses NaN and too few points in the domain: fewer than 16 or than a quarter of the control points.
     """
     grid = SplineGrid(domain, control)
     u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
@@ -241,7 +241,7 @@ def fit_surface(
     exact = search = solver
     if solver is interior_point:
         exact = partial(solver, tolerance=1e-4 if quick else 1e-8)
-        # As near the minimum as the choice of the smoothness needs.
+        # A coarser tolerance suffices to choose the smoothness.
         search = partial(solver, max_iterations=5) if quick else partial(solver, tolerance=1e-3)
     held_out = np.empty((0, 2))
     if smoothness is None:
@@ -254,14 +254,14 @@ def fit_surface(
         solution = solver(problem, values[chosen], mu, norms[chosen])
         control_points = grid.unflatten(solution.coefficients) @ axes
         if camera is not None:
-            # The point of each ray that lies in the plane through the origin across the view.
+            # Add the point of each ray in the plane through the origin that is perpendicular to the view.
             control_points = control_points + (grid.sites - camera.offset_px) @ np.linalg.pinv(camera.linear).T
         return problem, solution, BSplineSurface(grid, control_points)
 
     problem, solution, surface = solve(used, search if quick else exact)
-    norm = np.abs((surface(u) - x) @ axes.T @ axes).sum(axis=1)  # with a camera only the depth can be wrong
+    norm = np.abs((surface(u) - x) @ axes.T @ axes).sum(axis=1)  # with a camera only the depth counts
     if reject_mm is None:
-        # A surface as flexible as the points are few meets many of them exactly, and a median says nothing.
+        # With few points for its control points, a surface interpolates many of them and the median is meaningless.
         reject_mm = max(REJECT_MEDIANS * float(np.median(norm[used])), float(np.partition(norm[used], least - 1)[least - 1]))
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
     if quick or (inliers != used).any():
@@ -278,9 +278,9 @@ def fit_surface(
 
 
 def _outputs(x: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None) -> tuple[np.ndarray, ...]:
-    """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
+    """Axes (k, 3), values (n, k) of x along them, and weights (n, k) of the absolute residuals."""
     if camera is not None and not isinstance(camera, AffineCamera):
-        raise ValueError("camera: the rays of a near-affine camera make the depth no B-spline; fit without a camera.")
+        raise ValueError("camera: the rays of a near-affine camera have no depth that is a B-spline; fit without a camera.")
     n = len(x)
     axes = np.eye(3) if camera is None else camera.viewing_direction[None]
     if covariance_mm2 is None:
@@ -303,15 +303,15 @@ def _choose_smoothness(
 ) -> tuple[float, np.ndarray]:
     """The smoothness of least mean L1 error of held-out points, and the candidates tried with their errors (m, 2).
 
-    The error is in mm also where the fit is whitened: else the axes across the view, which are all but linear in u and so
-    like any smoothness, would outvote the depth.
+    The error is in mm even if the fit is whitened.  Else the two axes across the view would dominate the depth, although
+    they are nearly linear in u and so insensitive to the smoothness.
     """
     n, stiffness = len(u), norms.mean(axis=0)
     fold = np.empty(n, dtype=np.intp)
     fold[np.lexsort((*values.T, u[:, 0], u[:, 1]))] = np.arange(n) % _FOLDS
     tests = [fold == f for f in range(min(_FOLDS, -(-enough * _FOLDS // n)))]
     parts = [(L1Problem(grid, u[~test]), ~test, grid.design(u[test]), test) for test in tests]
-    # In the middle of what surfaces have needed; any start leads to the same end.
+    # A typical value as the first candidate; the result hardly depends on it.
     spread = np.median(np.abs(values - np.median(values, axis=0)))
     unit = 0.001 / _LADDER * n * float(np.prod(grid.cell_px)) / max(spread, 1e-9)
     errors: dict[int, float] = {}
@@ -326,7 +326,7 @@ def _choose_smoothness(
             errors[step] = total / np.sum(tests)
         return errors[step]
 
-    # Down a ladder of half decades to the lowest rung, then the parabola through it and its neighbours.
+    # Descend in steps of half a decade to the least error, then take the minimum of the parabola through its neighbours.
     best, direction = (0, 1) if error(1) < error(0) else (0, -1)
     while abs(best) < _EXTENT and error(best + direction) < error(best):
         best += direction

@@ -1,6 +1,6 @@
-"""Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF), whole or not at all.
+"""Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF).  No file is left incomplete.
 
-Open3D writes meshes and point clouds.  It is imported here only, when it is first needed, since it needs system libraries.
+Open3D writes meshes and point clouds.  Only this module imports it, and only when needed, since it needs system libraries.
 """
 
 import os
@@ -20,8 +20,8 @@ from lib.surface.bspline import BSplineSurface
 
 
 def open3d() -> ModuleType:
-    """The module open3d; an ImportError says in one line what to install where its system libraries are missing."""
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # in JupyterLab it prints lines, and hangs
+    """The module open3d; if its system libraries are missing, an ImportError says in one line what to install."""
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # in JupyterLab that prints lines and hangs
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -32,7 +32,7 @@ def open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles of a surface.
+    """A surface as triangles.
 
     `vertices_mm` (n, 3) have unit `normals` (n, 3) towards the camera; `faces` (m, 3) int32 are counter-clockwise as the
     camera sees them; `u` (n, 2) px are texture coordinates in the left image, `texture` (h, w, 3) uint8 RGB or None.
@@ -48,12 +48,12 @@ class Mesh:
 def surface_mesh(
     surface: BSplineSurface, *, step_px: float = 12.0, image: np.ndarray | None = None, mask: np.ndarray | None = None
 ) -> Mesh:
-    """Triangles over the surface's domain.
+    """A mesh of the surface over its domain.
 
     Args:
-        step_px: Distance of neighbouring vertices in the left image, at most.
+        step_px: Largest distance of neighbouring vertices in the left image.
         image: (h, w, 3) uint8 RGB left image for the texture.
-        mask: (h, w) bool, True where the surface is to be shown; None is everywhere.  A ValueError if no triangle is left.
+        mask: (h, w) bool, True where the surface is shown; None is everywhere.  A ValueError refuses a mask that hides all.
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
@@ -67,7 +67,7 @@ def surface_mesh(
         column, row = np.clip(np.rint(u), 0, (mask.shape[1] - 1, mask.shape[0] - 1)).astype(int).T
         faces = faces[np.asarray(mask, dtype=bool)[row, column][faces].all(axis=1)]
         if not len(faces):
-            raise ValueError("mask: it hides the whole surface; True marks what is shown.")
+            raise ValueError("mask: it hides the whole surface; True marks the parts to show.")
         kept, faces = np.unique(faces, return_inverse=True)
         u, faces = u[kept], faces.reshape(-1, 3)
     return Mesh(surface(u), surface.normal(u), faces.astype(np.int32), u, image)
@@ -76,7 +76,7 @@ def surface_mesh(
 def save_mesh(mesh: Mesh, path: str | Path) -> Path:
     """Write a mesh as binary glTF (.glb) with its texture inside, in metres, the unit of glTF.
 
-    An ImportError or OSError says where Open3D does not load or cannot write the file.
+    An ImportError says that Open3D does not load, an OSError that it cannot write the file.
     """
     path = _suffixed(path, ".glb")
     o3d = open3d()
@@ -87,13 +87,13 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
     written = o3d.t.geometry.TriangleMesh(tensor(mesh.vertices_mm.astype(np.float32) / 1000), tensor(mesh.faces))
     written.vertex.normals = tensor(mesh.normals.astype(np.float32))
     if mesh.texture is not None:
-        # Open3D counts texture coordinates from the lower left corner; pixel centres lie half a pixel in.
+        # Open3D's texture coordinates start at the lower left corner; pixel centres are half a pixel from it.
         uv = (mesh.u + 0.5) / mesh.texture.shape[1::-1] * (1, -1) + (0, 1)
         written.triangle.texture_uvs = tensor(uv[mesh.faces].astype(np.float32))
         written.material.set_default_properties()
         written.material.material_name = "defaultLit"
         written.material.texture_maps["albedo"] = o3d.t.geometry.Image(tensor(mesh.texture))
-    # The header of a GLB states the length of the file.
+    # The header of a GLB contains the length of the file.
     _write(path, lambda name: o3d.t.io.write_triangle_mesh(name, written),
            lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data))  # fmt: skip
     return path
@@ -114,16 +114,16 @@ def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None
 
 
 def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:
-    """Depth (h, w) float32 mm of every left pixel along the viewing direction, NaN outside the domain.
+    """Depth (h, w) float32 mm along the viewing direction at every left pixel, NaN outside the domain.
 
-    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre.
+    Depth 0 is the plane through the origin of the surface's frame, perpendicular to the view: an affine camera has no centre.
     """
     width, height = image_size_px
     return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)
 
 
 def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
-    """Write a depth map (h, w) as a 32-bit float TIFF in mm (NaN where there is none)."""
+    """Write a depth map (h, w) as a 32-bit float TIFF in mm (NaN = no depth)."""
     path = _suffixed(path, ".tiff", ".tif")
     if np.ndim(depth_mm) != 2:
         raise ValueError(f"depth_mm: expected (h, w), got shape {np.shape(depth_mm)}.")
@@ -132,7 +132,7 @@ def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
 
 
 def _write(path: Path, write: Callable[[str], bool], is_whole: Callable[[bytes], bool]) -> None:
-    """Let one of Open3D's writers fill a file: False says that it failed, but some say True of a part on a full disk."""
+    """Write a file with one of Open3D's writers.  These return False if they fail, but some return True on a full disk."""
     with whole(path) as partial:
         if not write(str(partial)) or not is_whole(partial.read_bytes()):
             raise OSError(f"{path}: Open3D could not write the whole file; is the disk full?")

@@ -1,6 +1,6 @@
 """Uniform bicubic B-splines over an image: basis, control grid, exact bending energy.
 
-``control = (n_x, n_y)`` points cover the domain (x0, y0, x1, y1) px, (n_x - 3) x (n_y - 3) cells, and one cell around it.
+The domain (x0, y0, x1, y1) px has (n_x - 3) x (n_y - 3) cells; ``control = (n_x, n_y)`` points cover it and a cell around it.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from scipy import sparse
 
 
 def cubic_basis(t: np.ndarray, derivative: int = 0) -> np.ndarray:
-    """The four uniform cubic B-splines that live on a span, (..., 4), at t in [0, 1], or a derivative in t."""
+    """Values (..., 4) at t in [0, 1] of the four uniform cubic B-splines that are not zero on a span, or of a derivative."""
     s = 1.0 - t
     if derivative == 0:
         return np.stack([s**3, (3 * t - 6) * t**2 + 4, (3 * s - 6) * s**2 + 4, t**3], axis=-1) / 6
@@ -23,7 +23,7 @@ def cubic_basis(t: np.ndarray, derivative: int = 0) -> np.ndarray:
 
 
 def _gram(n: int, derivative: int) -> sparse.csr_matrix:
-    """Integrals (n, n) over the domain of products of the basis functions' derivatives, spans of width 1."""
+    """Integrals (n, n) over the domain of products of the n basis functions' derivatives, for spans of width 1."""
     cell = np.arange(n - 3)[:, None, None]
     row, column = np.broadcast_arrays(cell + np.arange(4)[:, None], cell + np.arange(4))
     t, weight = np.polynomial.legendre.leggauss(4)  # exact for products of two cubics
@@ -34,10 +34,10 @@ def _gram(n: int, derivative: int) -> sparse.csr_matrix:
 
 @dataclass(frozen=True)
 class SplineGrid:
-    """Where the control points of a bicubic spline lie.
+    """The grid of control points of a bicubic spline.
 
-    `domain` is (x0, y0, x1, y1) px, `control` (n_x, n_y), each at least 4.  Coefficients are flat (n_x n_y,), the shorter
-    side fast, which makes every matrix of the fit as narrow-banded as can be.
+    `domain` is (x0, y0, x1, y1) px, `control` (n_x, n_y), each at least 4.  Coefficients are flat (n_x n_y,).  The index
+    along the shorter side varies fastest, which gives the matrices of the fit the smallest bandwidth.
     """
 
     domain: tuple[float, float, float, float]
@@ -60,7 +60,7 @@ class SplineGrid:
 
     @property
     def cells(self) -> tuple[int, int]:
-        """(n_x - 3, n_y - 3)."""
+        """Number of cells along x and y, (n_x - 3, n_y - 3)."""
         return self.control[0] - 3, self.control[1] - 3
 
     @property
@@ -70,21 +70,21 @@ class SplineGrid:
 
     @property
     def stride(self) -> tuple[int, int]:
-        """Steps of the flat index for one control point to the right, and for one down."""
+        """Steps of the flat index from a control point to the next one on the right, and to the next one below."""
         n_x, n_y = self.control
         return (1, n_x) if n_x <= n_y else (n_y, 1)
 
     @property
     def bandwidth(self) -> int:
-        """Number of diagonals below the main one that matrices of this grid fill."""
+        """Number of non-zero diagonals below the main one in matrices of this grid."""
         return 3 * sum(self.stride)
 
     def inside(self, u: np.ndarray) -> np.ndarray:
-        """Which of the points (n, 2) lie in the domain, borders included; NaN does not."""
+        """(n,) bool: True for points (n, 2) in the domain or on its border, False for NaN."""
         return ((u >= self.domain[:2]) & (u <= self.domain[2:])).all(axis=1)
 
     def locate(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cell (n, 2) int of each point, and its place (n, 2) in that cell, in [0, 1] for points inside."""
+        """Cell (n, 2) int of each point, and its position (n, 2) in that cell, in [0, 1] for points inside the domain."""
         position = (u - self.domain[:2]) / self.cell_px
         cell = np.clip(np.floor(position), 0, np.array(self.cells) - 1).astype(np.intp)
         return cell, position - cell
@@ -103,9 +103,9 @@ class SplineGrid:
 
     @cached_property
     def bending(self) -> sparse.csr_matrix:
-        """R (size, size): c.R.c = integral over the domain of s_xx^2 + 2 s_xy^2 + s_yy^2, exact (per px^2, over px^2).
+        """R (size, size): c.R.c is the exact integral over the domain of s_xx^2 + 2 s_xy^2 + s_yy^2, lengths in px.
 
-        Its null space is the linear functions, of dimension 3.
+        Its null space consists of the linear functions and has dimension 3.
         """
         along = zip(self.control, self.cell_px, strict=True)
         gram_x, gram_y = ([_gram(n, k) * h ** (1 - 2 * k) for k in range(3)] for n, h in along)
@@ -126,5 +126,5 @@ class SplineGrid:
 
     @property
     def sites(self) -> np.ndarray:
-        """Image points (n_y, n_x, 2) of the control points: f(sites) as control points reproduce a linear f exactly."""
+        """Image points (n_y, n_x, 2) of the control points: control points f(sites) reproduce a linear f exactly."""
         return self.domain[:2] + (np.stack(np.meshgrid(*map(np.arange, self.control)), axis=-1) - 1) * self.cell_px

@@ -15,22 +15,22 @@ from lib.surface.bspline import BSplineSurface, fit_surface
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
-#: Of `refine_rig`: so many neighbouring matches count as one; residuals beyond so many deviations lose their weight.
-_ALIKE, _SOFT = 10.0, 2.0
+#: For `refine_rig`: number of correlated matches that count as one; standard deviations above which residuals lose weight.
+_CORRELATED, _SOFT = 10.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What one stereo pair gave.
+    """The reconstruction from one stereo pair.
 
     Attributes:
         surface: Fitted to `points` over the left image points `u`.
         points: The triangulated points, with their covariances.
-        matches: The matches that passed the epipolar filter, one a point.
+        matches: The matches that passed the epipolar filter, one for each point.
         n_matches: Number of matches before the filter.
         mask_left: (h, w) bool, True where tool or glints hid the surface.
-        rig: The cameras that made the points: as given, or refined by the matches.
-        seconds: Wall clock of each stage: "mask", "refine" (where the rig was refined), "match", "triangulate", "surface".
+        rig: The cameras that triangulated the points: as given, or refined by the matches.
+        seconds: Wall clock of each stage: "mask", "refine" (if the rig was refined), "match", "triangulate", "surface".
     """
 
     surface: BSplineSurface
@@ -47,15 +47,15 @@ class Reconstruction:
         return self.matches.u_left
 
     def depth_range_mm(self, margin_mm: float = 0.0) -> tuple[float, float]:
-        """(near, far) of nearly all points along the left camera's view, as `lib.matching.match` takes it, and a margin."""
+        """(near, far) of 99 % of the points along the left camera's view, plus a margin, as `lib.matching.match` takes it."""
         low, high = np.percentile(self.points.x_mm @ self.rig.left.viewing_direction, (0.5, 99.5))
         return float(low) - margin_mm, float(high) + margin_mm
 
 
 def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
-    """Mask (n,) of the matches that lie on their epipolar lines, within `EPIPOLAR_SIGMAS` of their standard deviations.
+    """Mask (n,) of the matches within `EPIPOLAR_SIGMAS` of their standard deviations from their epipolar lines.
 
-    The median distance is subtracted first: a calibrated rig's lines may be off by part of a pixel, for all matches alike.
+    The median distance is subtracted first: a calibration error may shift all epipolar lines by part of a pixel.
     """
     if not len(matches):
         return np.zeros(0, dtype=bool)
@@ -66,15 +66,15 @@ def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
 def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
     """The rig that agrees best with its own calibration and with the epipolar geometry of dense matches.
 
-    With true cameras (A*, t*) and the unit normal n of the calibrated rig, n.A = 0, a match lies n.((A* - A) x + (t* - t))
-    and noise off its line: linear in the point x.  So a robust regression over all matches measures four numbers of the
-    calibration's error, and its covariance carries them over to all sixteen entries of its matrices: the update of a Kalman
-    filter whose prior is the calibration.  Few or poor matches change little.
+    With true cameras (A*, t*) and the unit normal n of the calibrated rig, n.A = 0, the epipolar distance of a match is
+    n.((A* - A) x + (t* - t)) plus noise, which is linear in the point x.  So a robust regression over all matches measures
+    four combinations of the calibration's errors.  The update of a Kalman filter with the calibration as its prior corrects
+    all sixteen entries of the matrices by them.  Few or poor matches change little.
 
     Args:
-        rig: A calibrated affine pair; a ValueError refuses another.
+        rig: A calibrated affine pair; a ValueError refuses other cameras.
         covariance: (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
-        matches: Of `lib.matching.match` with this rig, best of the static scene with the tool masked.
+        matches: From `lib.matching.match` with this rig, best of the static scene, with the tool masked.
     """
     if rig is None or not rig.is_affine:
         raise ValueError("rig: only an affine stereo pair can be refined; reconstruct with refine=False.")
@@ -88,11 +88,11 @@ def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> Ster
     centre = points.x_mm.mean(axis=0)
     measured, information = _regression(points.x_mm - centre, points.epipolar_px, matches.sigma_along(normal))
 
-    # The effect (4, 16) of a change of the entries on the four measured numbers.
+    # Jacobian (4, 16) of the four measured numbers with respect to the entries of the matrices.
     about_centre = np.eye(4)
     about_centre[3, :3] = centre
     effect = np.hstack([n * about_centre for n in normal])
-    # In information form, because a flat scene does not measure how the distance changes with depth.
+    # Information form, since for a flat scene the covariance is infinite: the change with depth is not measured.
     innovation = np.linalg.solve(np.eye(4) + information @ effect @ prior @ effect.T, information @ measured)
     matrices = np.vstack([rig.left.matrix, rig.right.matrix]) + (prior @ effect.T @ innovation).reshape(4, 4)
     return StereoRig(AffineCamera(matrices[:2]), AffineCamera(matrices[2:]))
@@ -107,9 +107,9 @@ def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np
         information = weighted.T @ design
         found = np.linalg.lstsq(information, weighted.T @ target, rcond=1e-12)[0]
         residual = target - design @ found
-        scale = max(1.4826 * np.median(np.abs(residual)), 1.0)  # not below what the matches state
+        scale = max(1.4826 * np.median(np.abs(residual)), 1.0)  # not below the matches' stated noise
         weight = 1 / (1 + (residual / (_SOFT * scale)) ** 2) ** 2
-    return found, information / (_ALIKE * scale**2)
+    return found, information / (_CORRELATED * scale**2)
 
 
 def reconstruct(
@@ -128,17 +128,17 @@ def reconstruct(
         setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
             approximate choice of smoothness, and `depth_only`.
         method: The matcher; see `lib.matching.match`.
-        refine: Correct the rig by a first, fast matching (`refine_rig`); None does so for a calibration of affine cameras.
+        refine: Correct the rig with a first, fast matching (`refine_rig`); None = only for a calibration of affine cameras.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
-        mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
+        mask_left, mask_right: (h, w) bool, True = ignore, in addition to glints and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.
         control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
-        depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
-            left camera. None is True in the fast setting with an affine rig.
-        depth_range_mm, max_epipolar_px: As for `match`; those of an earlier frame (`depth_range_mm` of its result) save time.
-        seconds: A dictionary that gets the seconds of each stage as it ends, also of the stage that fails.
+        depth_only: Fit one spline instead of three: the depth along the rays of the left camera, which must be affine.
+            None is True in the fast setting with an affine rig.
+        depth_range_mm, max_epipolar_px: As for `match`; the `depth_range_mm` of an earlier frame's result saves time.
+        seconds: A dictionary to which each stage adds its seconds as it ends, also if it fails.
 
-    A ValueError says what is wrong, as those of `match` and `fit_surface` do.
+    A ValueError refuses wrong arguments, and images without matches; see also `match` and `fit_surface`.
 
     >>> from lib import paths
     >>> from lib.recordings import Recording

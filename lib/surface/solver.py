@@ -1,7 +1,7 @@
 """L1 splines: min_c sum_i w_i |b_i.c - x_i| + mu c.R.c, the problem of paper Eq. (6), one output at a time.
 
-Eq. (6) decouples over x, y and z, and each output is a quadratic programme whose Newton matrix B'DB + 2 mu R has the
-narrow band of the spline's own grid.  `interior_point` takes a dozen factorisations, and the duality gap is the proof.
+Eq. (6) decouples over x, y and z.  Each output is a quadratic programme whose Newton matrix B'DB + 2 mu R has the narrow
+band of the spline's grid.  `interior_point` needs about a dozen factorisations; the duality gap bounds its error.
 """
 
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from lib.parallel import single_threaded_blas
 from lib.surface.grid import SplineGrid, cubic_basis
 
 UNHELD = (
-    "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control points."
+    "smoothness: too small to determine control points that have no data near them; increase it, or use fewer control points."
 )
 _PAIRS = np.triu_indices(4)
 
 
 class L1Problem:
-    """Points u (n, 2) px, all inside the domain of `grid`, and all of the Newton matrix that no iteration changes."""
+    """Points u (n, 2) px, all inside the domain of `grid`, and the constant parts of the Newton matrix."""
 
     def __init__(self, grid: SplineGrid, u: np.ndarray) -> None:
         self.grid, self.u, self.bending = grid, u, grid.bending
 
     @cached_property
     def design(self) -> sparse.csr_matrix:
-        """B (n, size)."""
+        """B (n, size): B @ coefficients is the spline at the points."""
         return self.grid.design(self.u)
 
     def normal_band(self, weights: np.ndarray, stiffness: float = 0.0) -> np.ndarray:
@@ -37,12 +37,12 @@ class L1Problem:
         packed = np.zeros((len(along_x), along_x.shape[1], 1))
         packed.ravel()[slot] = weights
         band = scatter @ np.matmul(along_y, packed * along_x).ravel() + stiffness * bending
-        return band.reshape(self.grid.size, -1).T  # its columns are contiguous, as LAPACK wants them
+        return band.reshape(self.grid.size, -1).T  # its columns are contiguous, as LAPACK needs them
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, ...]:
-        """The points by cells, in blocks of equal size so that the cells' sums are batched products: slots; the 10 distinct
-        products of basis functions along x, and along y; the matrix that adds the sums to the band; the bending energy.
+        """The points by cells, in blocks of equal size so that sums over cells are batched products: slots of the points; the
+        10 distinct products of basis functions along x, and along y; the matrix that adds the sums to the band; R as a band.
         """
         grid, height = self.grid, self.grid.bandwidth + 1
         cell, t = grid.locate(self.u)
@@ -73,12 +73,12 @@ class L1Problem:
 
 @dataclass(frozen=True)
 class L1Solution:
-    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof."""
+    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, with a bound on its error."""
 
     coefficients: np.ndarray  # c (size, k)
-    objective: np.ndarray  # (k,) the sums there
-    duality_gap: np.ndarray  # (k,) by how much they lie above the minimum at most, which follows from `dual`
-    dual: np.ndarray  # y (n, k), a dual feasible point, |y_i| <= w_i: the pull of each point on the surface
+    objective: np.ndarray  # (k,) values of the sum at c
+    duality_gap: np.ndarray  # (k,) upper bound on objective - minimum, which follows from `dual`
+    dual: np.ndarray  # y (n, k), a dual feasible point, |y_i| <= w_i: the force of each point on the surface
 
 
 def interior_point(
@@ -89,11 +89,11 @@ def interior_point(
 
     Args:
         x: (n, k) data of k outputs.
-        mu: Weight of the bending energy, at least 0; a number, or (k,) one an output.
+        mu: Weight of the bending energy, at least 0; a number, or (k,) one for each output.
         weights: w (n, k) > 0; None is 1.
         tolerance: Stop when the duality gap is below this fraction of the objective.
 
-    A ValueError says that the data do not determine the coefficients (a control point without data, at mu = 0).
+    A ValueError refuses data that do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
     columns = zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
@@ -112,7 +112,7 @@ def _interior_point(
     centre = w @ x / total
     x = x - centre
 
-    # A least-squares spline starts it, and its residuals give the unit of length.
+    # The initial value is a least-squares spline; its residuals give the unit of length.
     unit = max(np.abs(x).max(), 1e-9)  # x may be constant
     if (factor := cholesky(problem.normal_band(w, 2 * mu / unit))) is None:
         raise ValueError(UNHELD)
@@ -122,15 +122,15 @@ def _interior_point(
     x, c, residual = x / scale, c / scale, residual / scale
     bend = 2 * mu * scale  # the quadratic term grows as scale^2, the L1 term as scale
 
-    # The residual is split into p - q, both positive; the dual y has slacks w - y for p, w + y for q.  On the central path
-    # p (w - y) = q (w + y) = w.  Every step keeps the split and shrinks the dual residual by what it leaves of its length.
+    # The residual is p - q with p, q > 0; the dual y has slacks w - y for p and w + y for q.  On the central path
+    # p (w - y) = q (w + y) = w * a common factor.  A step of length alpha multiplies the dual residual by 1 - alpha.
     smooth = 1.0 + np.sqrt(residual**2 + 1.0)
     p, q = (smooth + residual) / 2, (smooth - residual) / 2
     slack_p, slack_q = w / p, w / q
     dual_residual = np.abs(B_T @ (w - slack_p) + bend * (R @ c)).sum()
 
     def certificate() -> tuple[float, float]:
-        """Objective, and bound on how far it lies above the minimum, from nothing but c and y."""
+        """Objective, and upper bound on objective - minimum, from c and y alone."""
         residual = B @ c - x
         objective = w @ np.abs(residual) + c @ bending_pull / 2
         # For every c*: F(c*) >= F(c) - (sum w|r| - y.r) + dual_residual.(c* - c), by convexity.
@@ -139,11 +139,11 @@ def _interior_point(
 
     for iteration in range(max_iterations + 1):
         bending_pull = bend * (R @ c)
-        # Each dual variable from its smaller slack, which keeps its digits.
+        # Compute each dual variable from its smaller slack, which is numerically more accurate.
         y = np.where(slack_p < slack_q, w - slack_p, slack_q - w)
         product_p, product_q = p * slack_p, q * slack_q
         complementarity = product_p.sum() + product_q.sum()
-        # The proof costs two products with B, so it waits until it can succeed.
+        # The bound costs two products with B, so compute it only when it may be small enough.
         enough = tolerance * max(w @ (p + q) + c @ bending_pull / 2, 1e-9 * total)
         if complementarity + dual_residual * np.abs(c).max() <= 4 * enough:
             objective, gap = certificate()
@@ -152,17 +152,17 @@ def _interior_point(
         p_over, q_over = p / slack_p, q / slack_q
         D = 1.0 / (p_over + q_over)
         factor = cholesky(problem.normal_band(D, bend)) if iteration < max_iterations else None
-        if factor is None:  # no more steps, or the limit of double precision: the gap says how near we are
+        if factor is None:  # no steps left, or the limit of double precision; the gap shows how close it is
             objective, gap = certificate()
             break
 
         def newton(pull, D=D, factor=factor, y=y, bending_pull=bending_pull):
-            """Newton step (dc, dy) that closes the dual residual, with D (B dc + pull) = dy."""
+            """Newton step (dc, dy) that makes the dual residual zero, with D (B dc + pull) = dy."""
             pull = D * pull
             dc = dpbtrs(factor, -bending_pull - B_T @ (y + pull), lower=1)[0]
             return dc, D * (B @ dc) + pull
 
-        # Predictor: straight to the solution.  How far it gets tells the corrector's centring and second-order term.
+        # Predictor: straight to the solution.  Its feasible length alpha determines the corrector's centring.
         _, dy = newton(p - q)
         ratio_p, ratio_q = dy / slack_p, dy / slack_q
         alpha = 1.0 / max(1.0, 1.0 - ratio_p.min(), ratio_p.max(), 1.0 + ratio_q.max(), -ratio_q.min())
@@ -175,7 +175,7 @@ def _interior_point(
         dc, dy = newton(p - q - goal_p + goal_q)
         dp, dq = goal_p - p + p_over * dy, goal_q - q - q_over * dy
         shrinking = ((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
-        longest = 1.0 / max(1.0, *(-np.min(step / value) for value, step in shrinking))  # up to 1 that keeps all positive
+        longest = 1.0 / max(1.0, *(-np.min(step / value) for value, step in shrinking))  # at most 1, keeps all positive
         alpha = (1.0 - np.clip(centrality, 1e-3, 5e-3)) * longest
         c, p, q = c + alpha * dc, p + alpha * dp, q + alpha * dq
         slack_p, slack_q = slack_p - alpha * dy, slack_q + alpha * dy
@@ -185,6 +185,6 @@ def _interior_point(
 
 
 def cholesky(band: np.ndarray) -> np.ndarray | None:
-    """Lower factor of a banded matrix, which is overwritten; None where it is not positive definite in double precision."""
+    """Lower Cholesky factor of a banded matrix, which is overwritten; None if it is not numerically positive definite."""
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     return None if info else factor

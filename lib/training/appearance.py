@@ -1,7 +1,7 @@
-"""What an image may look like: colours, light, optics and camera changed at will, while the landmarks stay.
+"""Strong random changes of an image's colours, light, optics and camera, which leave the landmarks in place.
 
-`disguised` is much stronger than the photometric part of `lib.training.augmentation`.  It takes away what a network could
-rely on by habit (orange ground, grey tool, sharp edges), so that shape decides.
+`disguised` is much stronger than the photometric part of `lib.training.augmentation`.  It removes cues on which a network
+could otherwise rely (orange ground, grey tool, sharp edges), so that the shape decides.
 """
 
 import cv2
@@ -15,11 +15,11 @@ from lib.training.drawings import fill
 def disguised(
     image: np.ndarray, u: np.ndarray, visibility: np.ndarray, rng: np.random.Generator, length_px: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """An image (h, w, 3) uint8 with other colours, light, things in front, optics and camera.
+    """Change the look of an image (h, w, 3) uint8 at random.  Returns the image, and `u` and `visibility` of its landmarks.
 
     Args:
-        u, visibility: Landmarks (3, 2) px and (3,); what is covered becomes hidden, what is blurred away unlabelled.
-        length_px: The tool's length, to which blur is compared; NaN without a tool.
+        u, visibility: Landmarks (3, 2) px and (3,).  A covered landmark becomes hidden, one blurred too much unlabelled.
+        length_px: The tool's length, which scales blur and occluders; NaN without a tool.
 
     >>> rng, u = np.random.default_rng(0), np.full((3, 2), 20.0)
     >>> disguised(np.full((32, 48, 3), 90, np.uint8), u, np.full(3, 2), rng, 9.0)[0].shape
@@ -32,11 +32,11 @@ def disguised(
     length_px = 40.0 if np.isnan(length_px) else length_px
     if kind < 0.4:  # another camera of the same scene
         return (255 * _colours(x, rng) + 0.5).astype(np.uint8), u, visibility
-    x = _colours(_things_in_front(x, u, hidden, rng, length_px), rng)
+    x = _colours(_occluders(x, u, hidden, rng, length_px), rng)
     x = _light(x, u, hidden, rng, length_px)
     x, blur_px = _optics(x, rng, length_px)
     x = _camera(x, rng)
-    if blur_px > 0.16 * length_px:  # nobody could place them
+    if blur_px > 0.16 * length_px:  # nobody could label them
         u = np.where((visibility > 0)[:, None], np.nan, u)
     return x, u, np.where(hidden & (visibility == 2), 1, visibility)
 
@@ -45,9 +45,9 @@ def _colours(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     kind = rng.choice(6, p=[0.25, 0.15, 0.3, 0.15, 0.1, 0.05])
     if kind == 1:
         x = x[..., rng.permutation(3)]
-    elif kind == 2:  # grey, of any filter
+    elif kind == 2:  # grey, from random weights of the channels
         x = np.repeat((x @ rng.dirichlet((2, 2, 2)).astype(np.float32))[..., None], 3, axis=2)
-    elif kind == 3:  # turned about the grey axis
+    elif kind == 3:  # hues rotated about the grey axis
         x = x @ cv2.Rodrigues(np.full(3, rng.uniform(-np.pi, np.pi) / np.sqrt(3)))[0].astype(np.float32)
     elif kind == 4:
         x = x @ rng.dirichlet((0.7, 0.7, 0.7), 3).T.astype(np.float32)
@@ -75,7 +75,7 @@ def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Gene
     rows, columns = np.mgrid[:h, :w].astype(np.float32)
     if rng.random() < 0.3:
         x = x * (0.3 + 1.2 * _field((h, w), rng, int(rng.integers(2, 6))))[..., None]
-    if rng.random() < 0.12:  # a lit disc, or a pupil, round about the tool
+    if rng.random() < 0.12:  # a lit disc, or a pupil, around the tool
         known = np.isfinite(u).all(1)
         centre = (u[known].mean(0) if known.any() else np.array([w, h]) / 2) + rng.normal(0, 0.4, 2) * length_px
         radius, soft = rng.uniform(0.8, 2.5) * max(length_px, 15.0), rng.uniform(0.5, 0.15 * length_px + 1)
@@ -91,8 +91,8 @@ def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Gene
     return np.clip(x, 0, 1)
 
 
-def _things_in_front(x, u, hidden, rng: np.random.Generator, length_px: float) -> np.ndarray:
-    """Bars, blobs and pieces of the image elsewhere: other instruments, shadows, blood, debris."""
+def _occluders(x, u, hidden, rng: np.random.Generator, length_px: float) -> np.ndarray:
+    """Draw bars, blobs and copied pieces of the image: other instruments, shadows, blood, debris.  Updates `hidden`."""
     h, w = x.shape[:2]
     for _ in range(rng.choice(4, p=[0.62, 0.2, 0.12, 0.06])):
         mask, centre = np.zeros((h, w), np.float32), rng.uniform((0, 0), (w, h))
@@ -132,7 +132,7 @@ def _optics(x: np.ndarray, rng: np.random.Generator, length_px: float) -> tuple[
         x = cv2.GaussianBlur(x, (0, 0), blur_px)
     if rng.random() < 0.15:
         x = motion_blur(x, rng.normal(0, 0.05 * length_px, 2))
-    if rng.random() < 0.2:  # few pixels, doubled again
+    if rng.random() < 0.2:  # a lower resolution, scaled up again
         small, whole = rng.uniform(0.3, 0.9), x.shape[1::-1]
         size = [max(int(side * small), 8) for side in whole]
         x = cv2.resize(cv2.resize(x, size, interpolation=cv2.INTER_AREA), whole, interpolation=cv2.INTER_LINEAR)
@@ -142,7 +142,7 @@ def _optics(x: np.ndarray, rng: np.random.Generator, length_px: float) -> tuple[
 
 
 def _camera(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Noise, interlacing, compression: uint8."""
+    """Add noise, interlacing and compression; returns uint8."""
     if rng.random() < 0.5:
         noise = rng.standard_normal(x.shape[:2] + (rng.choice([1, 3]),), dtype=np.float32)
         if rng.random() < 0.3:

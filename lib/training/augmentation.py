@@ -1,4 +1,4 @@
-"""Augmentation with kornia: image and landmarks move together, landmarks that leave the frame become absent.
+"""Augmentation with kornia: image and landmarks move together; landmarks that leave the frame become absent.
 
 Kornia's elastic, thin-plate and fisheye transforms are left out: they move the image and not the points.  Its motion blur
 shifts content unless its direction is 0.  Random numbers come from a batch's own generator: a resumed training repeats them.
@@ -15,7 +15,7 @@ from torch import Tensor
 from lib.geometry import check
 
 OCCLUDED, VISIBLE = 1, 2
-#: Height of an occluded landmark's target: its place is still learnt, and its height tells that it is not seen.
+#: Height of an occluded landmark's target: the network still learns its position, and that it is not visible.
 OCCLUDED_PEAK = 0.5
 
 
@@ -32,23 +32,23 @@ class Batch:
 
     @property
     def weight(self) -> Tensor:
-        """(n, 3): 0 for unlabelled landmarks, which have no loss; 1 also for absent ones, whose empty heatmap is trained."""
+        """(n, 3): 0 for unlabelled landmarks, which have no loss; 1 for others, also absent ones (their target is empty)."""
         return (~torch.isnan(self.u).any(-1) | (self.visibility == 0)).to(self.images.dtype)
 
     @property
     def peak(self) -> Tensor:
-        """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded, 0 absent."""
+        """(n, 3): height of the target, 1 if visible, `OCCLUDED_PEAK` if occluded, 0 if absent."""
         return self.images.new_tensor([0.0, OCCLUDED_PEAK, 1.0])[self.visibility.long()]
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Ranges of the random transforms; 0 or False switches one off.  The defaults are the paper's.
+    """Ranges of the random transforms; 0 switches one off.  The defaults are the paper's.
 
     Attributes:
-        rotation_deg: Up to this angle either way, about the image's centre.
-        zoom: Factor, drawn uniformly from this range.
-        photometric, photometric_share: Strength (0 to 1) of the changes of light and optics; part of a batch that has them.
+        rotation_deg: Largest rotation about the image's centre, in either direction.
+        zoom: Range of the scale factor, which is drawn uniformly.
+        photometric, photometric_share: Strength (0 to 1) of the changes of light and optics; share of a batch with changes.
     """
 
     rotation_deg: float = 30.0
@@ -61,7 +61,7 @@ class Augmentation:
         check(self, "photometric photometric_share", lambda v: 0 <= v <= 1, "must lie between 0 and 1")
 
     def __call__(self, batch: Batch, rng: np.random.Generator) -> Batch:
-        """The batch transformed; the caller's is left alone."""
+        """Return a transformed copy of the batch."""
         changed = round(self.photometric_share * len(batch.u)) if self.photometric else 0
         with torch.random.fork_rng(devices=[]):  # kornia draws from torch's global generator
             torch.manual_seed(int(rng.integers(2**63)))
@@ -76,7 +76,7 @@ class Augmentation:
         return Batch(images, u.to(batch.u.dtype), leave_frame(u, visibility, images.shape[-2:]))
 
     def light(self) -> K.ImageSequential:
-        """The changes of light, focus and sensor."""
+        """The random changes of light, focus and sensor."""
         s = self.photometric
         return K.ImageSequential(
             K.ColorJiggle(0.25 * s, 0.3 * s, 0.4 * s, 0.06 * s, p=0.8),
@@ -88,7 +88,7 @@ class Augmentation:
         )
 
     def _occlude(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator) -> None:
-        """Add glints (bright discs) and things in front (smooth ellipses), in place; what the latter cover is occluded."""
+        """Draw glints (bright discs) and occluders (smooth ellipses), in place; mark what an occluder covers as occluded."""
         h, w = images.shape[-2:]
         to = partial(torch.as_tensor, device=images.device)
         pixels = to(np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1, dtype=float))
@@ -108,13 +108,13 @@ class Augmentation:
 
 
 def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Visibility with 0 for every labelled landmark outside the pixels of an (h, w) image."""
+    """Returns visibility with 0 for every labelled landmark outside the pixels of an image of size (h, w)."""
     h, w = image_size
     outside = (u < -0.5).any(-1) | (u[..., 0] >= w - 0.5) | (u[..., 1] >= h - 0.5)  # NaN is not outside
     return torch.where(outside, 0, visibility)
 
 
-#: None, where sources change what they draw; the paper's; and that of closeups, which are turned and mirrored already.
+#: "none" is for sources that augment what they draw, "closeups" for closeups, which are already rotated and mirrored.
 AUGMENTATIONS = {
     "none": Augmentation(0.0, (1.0, 1.0)),
     "paper": Augmentation(),

@@ -21,23 +21,23 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     add = parser.add_argument
     add("what", choices=["generate", "propose", *STAGES, "finetune", "assemble", "export"],
-        help="generate: simulate the training data; propose: search it for what --initial takes for tools; frame, tool, "
-        "closeup: train this stage (tool: on the proposals, too, if they are there); finetune: train all "
-        "further on labelled recordings; assemble: join them into a detector with its card; export: write ONNX")  # fmt: skip
+        help="generate: simulate the training data; propose: find what the detector --initial takes for tools in it; frame, "
+        "tool, closeup: train this stage (tool: also on the proposals, if there are any); finetune: train all stages further "
+        "on labelled recordings; assemble: join the stages to a detector with its card; export: write ONNX")  # fmt: skip
     add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
-    add("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
+    add("--folder", type=Path, default=paths.CACHE / "training", help="folder of the checkpoints, with one folder per stage")
     add("--out", type=Path, help="finetune, assemble: weights file to write; export: the one to read (default: shipped)")
-    add("--scenes", type=int, default=120, help="generate: shards of 64 small scenes")
-    add("--closeups", type=int, default=40, help="generate: shards of 1024 closeups of a landmark")
-    add("--held-out", type=int, default=24, help="generate: shards of 16 full scenes, for the doubt")
-    add("--photographs", type=Path, help="generate: a folder of images, the ground of a third of the scenes made now")
-    add("--workers", type=int, help="generate: processes (default: one a core)")
+    add("--scenes", type=int, default=120, help="generate: number of shards of 64 small scenes")
+    add("--closeups", type=int, default=40, help="generate: number of shards of 1024 closeups")
+    add("--held-out", type=int, default=24, help="generate: number of shards of 16 full scenes, for the error models")
+    add("--photographs", type=Path, help="generate: a folder of images, the ground of about a quarter of the new scenes")
+    add("--workers", type=int, help="generate, propose: number of processes (default: one per core)")
     add("--preset", choices=sorted(PRESETS), default="best")
     add("--steps", type=int, default=6000)
     add("--rate", type=float, help="learning rate (default: the preset's)")
-    add("--minutes", type=float, help="finetune: stop after so many")
-    add("--features", type=int, help="channels (default: the shipped detector's)")
+    add("--minutes", type=float, help="finetune: stop after this many minutes")
+    add("--features", type=int, help="number of channels (default: as in the shipped detector)")
     add("--seed", type=int, default=0)
     add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from")
     add("--every", type=int, default=1, help="finetune: use every N-th frame")
@@ -58,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
         assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note,
                  Detector.load(a.initial) if a.initial else None)  # fmt: skip
     elif a.what == "export":
-        from lib.landmarks.export import export  # needs onnx, which nothing else does
+        from lib.landmarks.export import export  # nothing else needs the package onnx
 
         for stage, (path, difference) in export(Detector.load(a.out), a.onnx).items():
             print(f"{stage}: {path}, at most {difference:.2g} px from torch")
@@ -71,12 +71,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _images(folder: Path) -> list[Path]:
-    """The image files of a folder, each of which can be read."""
+    """List the image files of a folder, and check that each can be read."""
     found = sorted(path.resolve() for path in folder.rglob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     if not found:
         raise FileNotFoundError(f"{folder}: holds no .png or .jpg; give --photographs a folder of images.")
     for path in found:
-        read_image(path)  # names a damaged one
+        read_image(path)  # the error names a damaged file
     return found
 
 
@@ -96,8 +96,8 @@ def _finetune(a: argparse.Namespace) -> None:
         training += images[: 3 * len(images) // 4]
         held_out += images[3 * len(images) // 4 :]
     detector = Detector.load(a.initial)
-    how = {"simulated": a.data if any(a.data.glob("scenes_*.npz")) else None, "steps": a.steps, "minutes": a.minutes}
-    tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **how)
+    options = {"simulated": a.data if any(a.data.glob("scenes_*.npz")) else None, "steps": a.steps, "minutes": a.minutes}
+    tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **options)
     tuned.save(a.out)
     for name, scores in (("before", evaluate(detector, held_out).scores), ("after", evaluate(tuned, held_out).scores)):
         print(f"{name}: PCK@0.05 {scores.pck_0_05:.1f} %, median error {scores.median_px:.2f} px on held-out images")

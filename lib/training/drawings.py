@@ -1,9 +1,9 @@
-"""Outlines beyond the simulator's: flat drawings of forceps, many a second, and rendered jaws bent at an elbow.
+"""Shapes that the simulator does not render: flat drawings of forceps, which are fast to make, and jaws bent at an elbow.
 
-Drawings are no pictures of a real tool.  What they share with real ones is what a landmark is: a straight shaft, two jaws
-that leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Training on
-them, beside rendered scenes, makes the networks look for that and not for the shapes and metals that the simulator knows.
-Bent jaws are a warp of the image, since the renderer's training families have none.
+Drawings do not look like a real tool, but share the definition of the landmarks with it: a straight shaft, two jaws that
+leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Networks that are
+trained on drawings beside rendered scenes learn this definition, and not only the simulator's shapes and metals.  Bent jaws
+are made by warping a rendered image, since the renderer's training families have none.
 """
 
 import itertools
@@ -13,16 +13,16 @@ import numpy as np
 
 from lib.recordings.annotations import inside
 
-#: Centre line (n, 2) px and radius (n,) px.
+#: A part of the tool: centre line (n, 2) px and radius (n,) px.
 Part = tuple[np.ndarray, np.ndarray]
 
-_STRIPS = 6  # of different shades across a part, which make it look round
-#: Where along a jaw its elbow is, by how much it turns there (rad), and how often inward; how often both jaws have one.
-_PLACE, _TURN, _INWARD, _BOTH = (0.5, 0.9), (0.4, 2.2), 0.8, 0.75
+_STRIPS = 6  # number of strips of different shades across a part, which make it look round
+#: `bent`: ranges of the elbow's position along the jaw and of its angle (rad); probabilities of inward and of both jaws.
+_ELBOW, _ANGLE, _INWARD, _BOTH = (0.5, 0.9), (0.4, 2.2), 0.8, 0.75
 
 
 def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A ground without a tool, made of an image (h, w, 3) uint8: its large patches of colour, under random textures.
+    """Make a ground without a tool from an image (h, w, 3) uint8: its coarse colours under random textures.
 
     >>> drawn_ground(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0)).shape
     (90, 160, 3)
@@ -34,9 +34,9 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         coarse = rng.permutation(coarse.reshape(-1, 3)).reshape(coarse.shape)
     x = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_CUBIC).astype(np.float32)
     for _ in range(rng.integers(1, 5)):
-        fine = np.exp(rng.uniform(np.log(2), np.log(0.15 * w)))  # px a cell
+        cell_px = np.exp(rng.uniform(np.log(2), np.log(0.15 * w)))
         stretch = np.exp(rng.normal(0, 0.5))
-        cells_xy = max(int(w / fine * stretch), 2), max(int(h / fine / stretch), 2)
+        cells_xy = max(int(w / cell_px * stretch), 2), max(int(h / cell_px / stretch), 2)
         noise = rng.standard_normal((cells_xy[1], cells_xy[0]), dtype=np.float32)
         noise = cv2.resize(noise, (w, h), interpolation=cv2.INTER_CUBIC if rng.random() < 0.8 else cv2.INTER_NEAREST)
         if rng.random() < 0.4:  # threads, vessels, cracks
@@ -54,9 +54,9 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def drawn_tool(
     image: np.ndarray, rng: np.random.Generator, *, length_px: float | None = None, around: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A forceps drawn on an image (h, w, 3) uint8: the image, landmarks (3, 2) px and their visibility (3,).
+    """Draw a forceps on an image (h, w, 3) uint8; returns the image, landmarks (3, 2) px and their visibility (3,).
 
-    Its jaws are about `length_px` long (None: to suit the image), and landmark `around` is near the middle (None: anywhere).
+    The jaws are about `length_px` long (None = relative to the image); `around` is a landmark to centre (None = anywhere).
 
     >>> image, u, visibility = drawn_tool(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0))
     >>> image.shape, u.shape
@@ -86,7 +86,7 @@ def drawn_tool(
     if rng.random() < 0.3:  # rounded or conical end
         radius[0] *= rng.uniform(0.2, 0.8)
     parts.insert(int(rng.choice([0, 2])), (shaft, radius))
-    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
+    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross, and tip_1 is the left one
         u = u[[0, 2, 1]]
     if around is not None:
         shift = (np.array([w, h]) - 1) / 2 + rng.uniform(-8, 8, 2) - u[around]
@@ -98,30 +98,30 @@ def drawn_tool(
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:
-    """The outline of a jaw of length 1: its bow outward, bend, hook, taper, end and swelling; the place of its elbow and the
-    angle (rad) by which it turns inward there, 0 = none.
+    """Draw the outline of a jaw of length 1: outward bow, bend, hook, taper, end, swelling and teeth, the position of its
+    elbow, and the angle (rad) by which it turns inward there; 0 = none.
     """
 
-    def some(share: float, value: float) -> float:
-        return value if rng.random() < share else 0.0
+    def maybe(probability: float, value: float) -> float:
+        return value if rng.random() < probability else 0.0
 
     return {
-        "long": rng.uniform(0.75, 1.1), "bow": some(0.7, rng.uniform(-0.05, 0.35)), "power": rng.uniform(0.6, 1.8),
-        "bend": some(0.3, rng.normal(0, 0.3)), "hook": some(0.25, rng.uniform(0.02, 0.2)), "start": rng.uniform(0.5, 0.9),
-        "taper": rng.uniform(0.1, 1.0), "end": some(0.5, rng.uniform(0.1, 1.0)), "swell": some(0.25, rng.uniform(0.2, 1.5)),
-        "teeth": some(0.12, rng.uniform(0.1, 0.5)), "elbow": rng.uniform(0.3, 0.95),
-        "turn": some(0.4, rng.choice([-1, 1], p=[0.2, 0.8]) * rng.uniform(0.3, 1.9)),
+        "long": rng.uniform(0.75, 1.1), "bow": maybe(0.7, rng.uniform(-0.05, 0.35)), "power": rng.uniform(0.6, 1.8),
+        "bend": maybe(0.3, rng.normal(0, 0.3)), "hook": maybe(0.25, rng.uniform(0.02, 0.2)), "start": rng.uniform(0.5, 0.9),
+        "taper": rng.uniform(0.1, 1.0), "end": maybe(0.5, rng.uniform(0.1, 1.0)), "swell": maybe(0.25, rng.uniform(0.2, 1.5)),
+        "teeth": maybe(0.12, rng.uniform(0.1, 0.5)), "elbow": rng.uniform(0.3, 0.95),
+        "turn": maybe(0.4, rng.choice([-1, 1], p=[0.2, 0.8]) * rng.uniform(0.3, 1.9)),
     }  # fmt: skip
 
 
 def _jaw(
     shape: dict[str, float], side: int, angle: float, length: float, thick: float, base: np.ndarray, aside: float
 ) -> Part:
-    """Centre line (n, 2) px from the base to the tip, and radius (n,) px."""
+    """Returns the centre line (n, 2) px from the base to the tip, and the radius (n,) px."""
     s = np.linspace(0, 1, 24)
     along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side + shape["bend"] * s**2
     across = across - side * shape["hook"] * np.clip((s - shape["start"]) / (1 - shape["start"]), 0, 1) ** 2
-    if shape["turn"]:  # beyond the elbow the jaw goes on in another direction: its tip is its end, not the corner
+    if shape["turn"]:  # beyond the elbow the jaw has another direction; the tip is its end, not the corner
         before, beyond = s <= shape["elbow"], np.maximum(s - shape["elbow"], 0) * shape["long"]
         corner = np.interp(shape["elbow"], s, along), np.interp(shape["elbow"], s, across)
         along = np.where(before, along, corner[0] + beyond * np.cos(shape["turn"]))
@@ -131,24 +131,24 @@ def _jaw(
     radius = radius * (1 + shape["teeth"] * (np.arange(24) % 2) * (s > 0.4))
     cos, sin = np.cos(angle), np.sin(angle)
     line = length * (along[:, None] * [cos, sin] + across[:, None] * [-sin, cos])
-    line += (1 - s)[:, None] * aside * np.array([-sin, cos])  # the jaws leave the shaft beside each other
+    line += (1 - s)[:, None] * aside * np.array([-sin, cos])  # the jaws leave the shaft side by side
     return base + line, np.maximum(radius, 0.35)
 
 
 def _outline(line: np.ndarray, radius: np.ndarray, low: float, high: float) -> np.ndarray:
-    """The polygon between two fractions (-1 to 1) of the radius beside a line."""
+    """The polygon (2 n, 2) px between two parallels of a line, at `low` and `high` times the radius (-1 to 1)."""
     along = np.gradient(line, axis=0)
     beside = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     return np.vstack([line + low * radius[:, None] * beside, (line + high * radius[:, None] * beside)[::-1]])
 
 
 def fill(image: np.ndarray, polygon: np.ndarray, value: float | list[float]) -> None:
-    """Fill a polygon (n, 2) px of an image, in place, to a sixteenth of a pixel."""
+    """Fill a polygon (n, 2) px of an image, in place; its corners are rounded to 1/16 px."""
     cv2.fillPoly(image, [np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)], value, cv2.LINE_AA, 4)
 
 
 def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
-    """With up to three shadows, which lights from the side turn, stretch and move, until they look like tools."""
+    """Add one to three shadows of the tool, rotated, stretched and shifted as by light from the side."""
     for _ in range(rng.choice(3, p=[0.6, 0.3, 0.1]) + 1):
         mask, grown = np.zeros(x.shape[:2], np.float32), rng.uniform(0.8, 1.3)
         base, offset = parts[1][0][0], rng.normal(0, rng.choice([0.15, 0.6]), 2) * length
@@ -166,20 +166,20 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
     tone = np.exp(rng.uniform(np.log(12), np.log(230))) * np.exp(rng.normal(0, rng.choice([0.04, 0.3], p=[0.7, 0.3]), 3))
     layer, mask = np.zeros_like(x), np.zeros((h, w), np.float32)
     phase, round_, shine, where = rng.uniform(-1, 1), rng.uniform(0, 1), rng.uniform(0, 1.5), rng.uniform(-0.7, 0.7)
-    own = rng.random() < 0.5  # each part has its own shade
+    own_shades = rng.random() < 0.5  # each part has its own
     for line, radius in parts:
-        level = tone * (np.exp(rng.normal(0, 0.35)) if own else 1.0)
+        level = tone * (np.exp(rng.normal(0, 0.35)) if own_shades else 1.0)
         fill(mask, _outline(line, radius, -1, 1), 1.0)
         for low, high in itertools.pairwise(np.linspace(-1, 1, _STRIPS + 1)):
             q = (low + high) / 2
             shade = 1 - round_ * (0.5 + 0.5 * phase * q) * abs(q - 0.3 * phase)
             shade += shine * np.exp(-(((q - where) / 0.25) ** 2))
             fill(layer, _outline(line, radius * 1.05, low - 0.02, high + 0.02), (level * max(shade, 0.05)).tolist())
-    if rng.random() < 0.6:  # light and reflections that change along it
+    if rng.random() < 0.6:  # light and reflections vary along the tool
         cells = max(int(w / (rng.uniform(0.1, 1.0) * length)), 2)
         field = cv2.resize(rng.random((cells, cells), dtype=np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
         layer = layer * (1 + rng.uniform(0.2, 1.0) * (2 * field - 1))[..., None]
-    if rng.random() < 0.4:  # mirrors the field
+    if rng.random() < 0.4:  # the tool reflects the scene
         share = np.float32(rng.uniform(0.1, 0.7))
         around = np.roll(cv2.flip(x, int(rng.integers(-1, 2))), tuple(rng.integers((h, w))), axis=(0, 1))
         layer = layer * (1 - share) + share * around * rng.uniform(0.5, 1.5)
@@ -191,23 +191,23 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
 def bent(
     image: np.ndarray, u: np.ndarray, visibility: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """An image (h, w, 3) uint8 with one jaw or both bent, its landmarks (3, 2) px and their visibility (3,).
+    """Bend one jaw or both in an image (h, w, 3) uint8; returns it, the landmarks (3, 2) px and their visibility (3,).
 
-    What lies round the end of a jaw is turned about the elbow, what is farther or behind less, so that nothing tears.  Where
-    the jaws cross, the tips exchange their names.
+    The image around the end of a jaw is rotated about the elbow.  The rotation decreases with the distance from the elbow and
+    behind it, so that nothing tears.  If the jaws cross then, the tips exchange their names.
 
     >>> u = np.array([[20.0, 30], [60, 20], [60, 40]])
     >>> image, moved, _ = bent(np.zeros((60, 90, 3), np.uint8), u, np.full(3, 2), np.random.default_rng(0))
     >>> image.shape, moved.shape
     ((60, 90, 3), (3, 2))
     """
-    place, turn = rng.uniform(*_PLACE), rng.uniform(*_TURN) * (1 if rng.random() < _INWARD else -1)
+    place, turn = rng.uniform(*_ELBOW), rng.uniform(*_ANGLE) * (1 if rng.random() < _INWARD else -1)
     straight = u
     for k in rng.permutation([1, 2])[: 2 if rng.random() < _BOTH else 1]:
         ahead, other = u[k] - u[0], u[3 - k] - u[0]
         sign = np.sign(ahead[0] * other[1] - ahead[1] * other[0]) or 1.0
         elbow, reach = u[0] + place * ahead, (1 - place) * np.linalg.norm(ahead)
-        for _ in range(2):  # a larger turn at once would fold the image
+        for _ in range(2):  # one rotation by the whole angle would fold the image
             image, u = _turned(image, u, elbow, u[k] - elbow, sign * turn / 2, reach)
     if np.linalg.det(u[1:] - u[0]) * np.linalg.det(straight[1:] - straight[0]) < 0:
         u, visibility = u[[0, 2, 1]], visibility[[0, 2, 1]]
@@ -217,7 +217,7 @@ def bent(
 def _turned(
     image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarray, turn: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What lies `ahead` of the elbow, within `reach` px, turned about it by up to `turn` rad; within twice that, by less."""
+    """Rotate what lies `ahead` of the elbow, within `reach` px, by up to `turn` rad; at 2 `reach` the rotation ends."""
     radius, first = 2.0 * reach, np.arctan2(*ahead[::-1])
     low = np.clip(np.floor(elbow - radius), 0, image.shape[1::-1]).astype(int)
     high = np.clip(np.ceil(elbow + radius) + 1, 0, image.shape[1::-1]).astype(int)
@@ -225,17 +225,17 @@ def _turned(
         return image, u
 
     def turned_by(far: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """The turn (rad) of what is then seen `far` px from the elbow at an `angle`."""
+        """Rotation (rad) of what the rotated image shows `far` px from the elbow, in the direction `angle`."""
         fade = np.clip((radius - far) / (0.8 * reach), 0, 1)
         return turn * 0.5 * (1 + np.cos(angle - first)) * fade**2 * (3 - 2 * fade)
 
     z = np.arange(low[0], high[0]) - elbow[0] + 1j * (np.arange(low[1], high[1]) - elbow[1])[:, None]
-    z = z * np.exp(-1j * turned_by(np.abs(z), np.angle(z)))  # where a pixel comes from
+    z = z * np.exp(-1j * turned_by(np.abs(z), np.angle(z)))  # the source of each pixel
     maps = (z.real + elbow[0]).astype(np.float32), (z.imag + elbow[1]).astype(np.float32)
     image = image.copy()
     image[low[1] : high[1], low[0] : high[0]] = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     far, angle = np.linalg.norm(u - elbow, axis=1), np.arctan2(*(u - elbow).T[::-1])
     now = angle
-    for _ in range(60):  # the inverse: half a step contracts
+    for _ in range(60):  # the inverse, by iteration; half steps make it converge
         now = (now + angle + turned_by(far, now)) / 2
     return image, elbow + far[:, None] * np.column_stack([np.cos(now), np.sin(now)])

@@ -1,4 +1,4 @@
-"""Fitting what makes covariance and confidence true: the error model of each stage, on validation images."""
+"""Fit of the error model of each stage, from which covariance and confidence come, on validation images."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -17,23 +17,23 @@ from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.training.samples import LabelledImage
 
-#: What a tool of 2 mm/s moves between two frames at 25 Hz, and the tool's length at that scale.
+#: Motion of a tool at 2 mm/s between two frames at 25 Hz, and the tool's length at the same scale.
 TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
-#: Weight of a prior, in landmarks.  Chosen by how true the doubt is on held-out scenes after a fit on 20 others.
+#: Weight of a prior, as a number of landmarks.  Chosen by the calibration on held-out scenes after a fit on 20 others.
 _PRIOR = 20.0
-#: How strongly slopes are kept small: of the two log variances, and of the logit, chosen on held-out scenes.
+#: Ridge penalties on the slopes of the two log variances and of the logit; chosen on held-out scenes.
 _RIDGE = (1e-2, 1e-2, 1e-3)
-_INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard normal plane lie
-#: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
+_CHI2_95 = chdtri(2, 0.05)  # 95 % quantile of chi-square with 2 degrees of freedom
+#: Larger errors, in pixels of a stage's input, are gross: the covariance does not describe them.
 _GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0}
 
 
 class Seen(NamedTuple):
-    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 9) as `features_of` gives them, and `errors` (m, 2).
+    """Peaks of landmarks with index `landmark` (m,): their `features` (m, 3, 9) by `features_of`, and their `errors` (m, 2).
 
-    All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
-    `moved` (m, 2) is the whole correction of a closeup.  `known` (m,) is False where a landmark is there but unlabelled.
-    `label_sd` (m,) is the labels' own standard deviation along each axis.
+    All in pixels of the stage's input.  Errors are NaN without a label; one within `tolerance` (m,) counts as correct.
+    `moved` (m, 2) is the correction of a closeup at gain 1.  `known` (m,) is False if a landmark is in view but unlabelled.
+    `label_sd` (m,) is the standard deviation of the labels along each axis.
     """
 
     features: np.ndarray
@@ -45,15 +45,15 @@ class Seen(NamedTuple):
     label_sd: np.ndarray
 
     def fit(self, gross_px: float, prior: ErrorModel | None = None) -> ErrorModel:
-        """Maximum likelihood of the errors below `gross_px`, and a logistic regression of being correct.
+        """Fit the variances by maximum likelihood of the errors below `gross_px`, the confidence by logistic regression.
 
-        An error is the detector's and the label's: the variance beyond the label's is fitted.  It is log linear in the
-        features; the tips, each other's mirror images, share all coefficients.  Few landmarks change the coefficients of a
-        `prior` little.  Errors have longer tails than a Gaussian: with a mean normalised squared error of 2 more than 5 % lie
-        outside the 95 % ellipses, and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the
-        base and for the tips.
+        An error is the sum of the detector's and the label's; the fitted variance is the detector's alone.  It is log-linear
+        in the features.  The tips are mirror images of each other and share all coefficients.  The fewer the landmarks, the
+        closer the coefficients stay to the `prior`.  Errors have longer tails than a Gaussian: if the mean normalised squared
+        error is 2, more than 5 % lie outside the 95 % ellipses; if 5 % do, the mean is below 2.  The constants are set
+        halfway between the two, for the base and for the tips.
 
-        A ValueError for fewer than 20 landmarks and no prior.
+        Raises ValueError for fewer than 20 landmarks and no prior.
         """
         size = np.linalg.norm(self.errors, axis=1)
         use = np.isfinite(size) & (size < gross_px)
@@ -61,8 +61,8 @@ class Seen(NamedTuple):
             if prior is not None:
                 return prior
             raise ValueError(f"images: only {use.sum()} landmarks to calibrate on; give at least 20.")
-        squared, of_label, tip = self.errors[use] ** 2, self.label_sd[use] ** 2, self.landmark > 0
-        of_label = of_label * min(1.0, 0.9 * squared.mean() / max(of_label.mean(), 1e-12))  # labels better than was said
+        squared, label_var, tip = self.errors[use] ** 2, self.label_sd[use] ** 2, self.landmark > 0
+        label_var = label_var * min(1.0, 0.9 * squared.mean() / max(label_var.mean(), 1e-12))  # if better than stated
 
         def fitted(row: int, loss: Callable[[np.ndarray], tuple], among: np.ndarray, start: np.ndarray) -> np.ndarray:
             x = np.column_stack([~tip, tip, self.features[:, row, 1:]])[among].astype(float)
@@ -72,8 +72,8 @@ class Seen(NamedTuple):
         def variance(axis: int) -> np.ndarray:
             def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 own = np.exp(z)
-                ratio = squared[:, axis] / (own + of_label)
-                return np.log(own + of_label) + ratio, (1 - ratio) * own / (own + of_label)
+                ratio = squared[:, axis] / (own + label_var)
+                return np.log(own + label_var) + ratio, (1 - ratio) * own / (own + label_var)
 
             start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 3 + [0.0] * (FEATURES - 1)
             return fitted(axis, deviance, use, start if prior is None else prior.log_variance[axis])
@@ -83,45 +83,45 @@ class Seen(NamedTuple):
         correct = self._correct(own)[self.known]
         start = (prior or ErrorModel()).logit
         logit = fitted(2, lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.known, start)
-        total = own[use] + of_label[:, None]
-        normalised, of_own = (squared / total).sum(1), own[use] / total
+        total = own[use] + label_var[:, None]
+        normalised, own_share = (squared / total).sum(1), own[use] / total
         for group, columns in ((~tip[use], np.s_[:1]), (tip[use], np.s_[1:3])):
             if group.any():
-                share = 0.5 * of_own[group].mean() * group.sum() / (group.sum() + (_PRIOR if prior is not None else 0))
-                log_variance[:, columns] += share * np.log(np.quantile(normalised[group], 0.95) / _INSIDE)
+                share = 0.5 * own_share[group].mean() * group.sum() / (group.sum() + (_PRIOR if prior is not None else 0))
+                log_variance[:, columns] += share * np.log(np.quantile(normalised[group], 0.95) / _CHI2_95)
         return ErrorModel(log_variance, logit)
 
     def _correct(self, own: np.ndarray) -> np.ndarray:
-        """(m,) probability that a landmark of variances `own` (m, 2) is correct, given where a label that errs is."""
-        of_label = np.maximum(self.label_sd[:, None] ** 2, 1e-9)
-        mean, variance = self.errors * own / (own + of_label), (own * of_label / (own + of_label)).mean(axis=1)
+        """(m,) probability that a landmark with variances `own` (m, 2) is correct, given its distance from the label."""
+        label_var = np.maximum(self.label_sd[:, None] ** 2, 1e-9)
+        mean, variance = self.errors * own / (own + label_var), (own * label_var / (own + label_var)).mean(axis=1)
         inside = chndtr(self.tolerance**2 / variance, 2, np.minimum((mean**2).sum(axis=1) / variance, 1e4))
         return np.where(self.label_sd > 0, np.nan_to_num(inside), np.linalg.norm(self.errors, axis=1) <= self.tolerance)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (one of `gains`) and bias (3, 2) of base and tips along each axis that leave the smallest absolute errors."""
-        # What was expected must be near the landmark; a closeup's own gross errors count.
+        """Gain (one of `gains`) and bias (3, 2) along each axis that minimise the mean absolute error of base and tips."""
+        # Errors of the expected position must not be gross; gross errors of the closeup itself count.
         use = np.linalg.norm(self.errors - self.moved, axis=1) < gross_px
         best, bias = np.ones((3, 2)), np.zeros((3, 2))
         for k, axis in product(([0], [1, 2]), (0, 1)):  # the base, and both tips
             own = use & np.isin(self.landmark, k)
             if own.any():
-                left = self.errors[own, axis] + (np.asarray(gains)[:, None] - 1) * self.moved[own, axis]
-                centre = np.median(left, axis=1)
-                i = np.abs(left - centre[:, None]).mean(1).argmin()
+                residual = self.errors[own, axis] + (np.asarray(gains)[:, None] - 1) * self.moved[own, axis]
+                centre = np.median(residual, axis=1)
+                i = np.abs(residual - centre[:, None]).mean(1).argmin()
                 best[k, axis], bias[k, axis] = gains[i], centre[i]
         return best, bias
 
 
 def _coefficients(
-    loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool, small: float
+    loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool, ridge_slopes: float
 ) -> np.ndarray:
-    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope.
+    """Coefficients beta that minimise the mean of a loss of ``x @ beta``; `loss` returns its values and their derivatives.
 
-    They are kept near `start` if that is a prior; else the slopes alone are kept `small`.
+    A ridge penalty keeps them near `start` if that is a prior; else it keeps the slopes small, with weight `ridge_slopes`.
     """
     slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.where(is_prior, start, 0.0)
-    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else small * slopes
+    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else ridge_slopes * slopes
 
     def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(x @ beta)
@@ -133,12 +133,12 @@ def _coefficients(
 def seen_by(
     detector: Detector, stage: str, labelled: LabelledImage, rough: Landmarks | None, found: tuple | None = None
 ) -> Seen:
-    """What a stage decodes in one image, given the landmarks `rough` of the stage before, beside the labels.
+    """Compare a stage's peaks in one image with the labels, given the landmarks `rough` of the previous stage.
 
-    `found` is what `Detector.stage_peaks` gave, if that is known.
+    `found` is the result of `Detector.stage_peaks`, if known.
     """
     labels, image = labelled.in_view, labelled.image[None]
-    # A stage that only says where the next one looks is right if that finds the landmark there.
+    # A stage that only guides the next one is correct if the next one can find the landmark there.
     share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
     tolerance, label_sd = np.repeat(share * tool_length_px(labelled.u), 3), np.broadcast_to(labelled.sd_px, 3)
     known = np.isfinite(labels).all(1) | (labelled.visibility == 0)
@@ -163,7 +163,7 @@ def seen_by(
 
 
 def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> ErrorModel:
-    """The error model of a stage by what it saw; a `ValueError` if that is too little, and there is no prior."""
+    """Fit the error model of a stage.  Raises ValueError if it found too few landmarks and there is no prior."""
     if not any(len(part.landmark) for part in parts):
         if prior is not None:
             return prior
@@ -172,8 +172,8 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
     gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
     if stage not in CLOSE:
         return seen.fit(gross_px, prior)
-    # Many exact labels told a prior's gain and bias, and few labels have a constant error of their own.  While tracking, the
-    # place where a landmark is expected is an old one, which is evidence of nothing.
+    # A prior's gain and bias were fitted on many exact labels; a few labels may have a constant error.  While tracking, the
+    # expected position is that of an earlier frame and no evidence, so the gain is 1.
     gains = [1.0] if stage == "tracking" else np.linspace(0, 1, 51)
     gain, bias = seen.gain(gross_px, gains) if prior is None else map(np.array, (prior.gain, prior.bias))
     seen = seen._replace(errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
@@ -184,42 +184,42 @@ def fit_error_models(
     detector: Detector, images: Iterable[LabelledImage], *, for_closeups: Sequence[LabelledImage] = (), anew: bool = True,
     progress: bool = False,
 ) -> Detector:  # fmt: skip
-    """The detector with the error model of every stage fitted on validation images, never trained on.
+    """Fit the error model of every stage on validation images, which no training saw.  Returns a new detector.
 
-    A closeup's correction is scaled by the gain that minimises the validation error, and centred; while tracking it counts
-    in full.  Tracking is fitted on the same images, the tool displaced by `TRACKED_SHIFT_PX`, every fourth time by five
-    times as much.
+    A closeup's correction is multiplied by the gain that minimises the validation error, and its bias is subtracted; while
+    tracking the gain is 1.  Tracking is fitted on the same images, with the tool displaced by `TRACKED_SHIFT_PX` (rms), and
+    by five times as much with probability 1/4.
 
     Args:
         images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
-            recording correlate because they share one tool.
-        for_closeups: More images, for gain, bias and covariance of the stages that look at closeups, and for tracking.
-        anew: False begins from the models that the detector has, and changes them as far as so many images tell.
+            recording are correlated by its one tool.
+        for_closeups: More images, for gain, bias and covariance of the stages that use closeups, and for tracking.
+        anew: False = start from the detector's own error models, which change more the more landmarks are found.
 
-    A ValueError if too few landmarks are found in the images, and there is no model to begin from.
+    Raises ValueError if too few landmarks are found in the images and there is no model to start from.
     """
     images = list(images)
     n, images, before = len(images), [*images, *for_closeups], detector.error_models
-    # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
+    # Closeups are fitted on their full corrections, not on those scaled by an earlier gain.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)
     rng = np.random.default_rng(0)
     for stage in detector.stages:
         parts, found = [], []
         for labelled, start in zip(tqdm(images, disable=not progress, unit="image", desc=stage), rough, strict=True):
-            if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice
+            if stage == "tracking":  # the tool jumps sometimes, which tracking has to notice
                 if not (start.confidence >= TRACKED_FROM).all():
-                    continue  # nothing is tracked from such an image
+                    continue  # tracking does not start from such an image
                 moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1) * tool_length_px(start.u) / _LENGTH_PX
                 start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
                 start = detector.refine(labelled.image[None], start, stage)
             found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
-        if stage in ("closeup", "closer"):  # how often a landmark is right, the other images tell
+        if stage in ("closeup", "closer"):  # their confidence is fitted on `images` alone
             parts[n:] = (part._replace(known=np.zeros_like(part.known)) for part in parts[n:])
         fit = _fitted(stage, parts if stage in CLOSE else parts[:n], None if anew else before.get(stage))
         detector = replace(detector, error_models=detector.error_models | {stage: fit})
-        if stage == "frame":  # the landmarks that the next stage starts from
+        if stage == "frame":  # the landmarks from which the next stage starts
             rough = [detector.searched(image, detector.coarse(image)) for image in (part.image[None] for part in images)]
         elif stage != "tracking":
             known = [None] * len(images) if stage in CLOSE else found  # a closeup's correction depends on the gain

@@ -14,13 +14,13 @@ from lib.training.samples import LabelledImage
 
 
 class Evaluation(NamedTuple):
-    """Detections in n images beside their labels.
+    """Detections in n images, and their labels.
 
     Attributes:
         u_true: (n, 3, 2) labels in view, NaN elsewhere.
         visibility: (n, 3) 0, 1, 2, and -1 where nothing is labelled.
         length_px: (n,) the tool's length, the unit of PCK, also where a tip is out of the frame.
-        label_sd_px: (n, 3) of the labels; covariances are judged with it, since an error is the detector's and the label's.
+        label_sd_px: (n, 3) standard deviation of the labels.  Scores add it to the covariances, as labels have errors, too.
     """
 
     landmarks: Landmarks
@@ -32,18 +32,18 @@ class Evaluation(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Iterable[Self]) -> Self:
-        """Several evaluations as one."""
+        """Join several evaluations."""
         found, *arrays, names = zip(*parts, strict=True)
         return cls(Landmarks.join(found), *map(np.concatenate, arrays), list(chain(*names)))
 
     @property
     def scores(self) -> Scores:
-        """Over all landmarks."""
+        """Scores of all landmarks."""
         return self.by({"all": True})["all"]
 
     @property
     def error_px(self) -> np.ndarray:
-        """(n, 3): infinite where missed, NaN without a label."""
+        """(n, 3) distance from the label: infinite if missed, NaN without a label."""
         return errors_px(self.landmarks.u, self.u_true)
 
     @property
@@ -53,12 +53,12 @@ class Evaluation(NamedTuple):
 
     @property
     def confidence_error(self) -> float:
-        """Calibration error of confidence as the probability of being `correct`; no landmark out of view is."""
+        """Calibration error of the confidence as the probability of `correct`; a landmark out of view is never correct."""
         known = np.isfinite(self.u_true).all(2) | (self.visibility == 0)
         return calibration_error(self.landmarks.confidence[known], self.correct[known])
 
     def by(self, groups: Mapping[str, np.ndarray | bool]) -> dict[str, Scores]:
-        """Scores of groups of landmarks, each a mask that fits (n, 3); groups without a label are left out."""
+        """Scores of groups of landmarks, each a mask that broadcasts to (n, 3); groups without a label are left out."""
         found, result = self.landmarks, {}
         covariance = found.covariance + self.label_sd_px[..., None, None] ** 2 * np.eye(2)
         for name, mask in groups.items():
@@ -76,7 +76,7 @@ class Evaluation(NamedTuple):
         return self.by({"visible": self.visibility == 2, "occluded": self.visibility == 1})
 
     def detection(self) -> dict[str, float]:
-        """Percent precision and recall, above confidence 0.5, of landmarks in the frame, and of those not hidden there."""
+        """Precision and recall in percent, at confidence 0.5, of landmarks in the frame, and of those visible there."""
         detected = (self.landmarks.confidence >= 0.5) & (self.visibility >= 0)
         result: dict[str, float] = {}
         for name, there in (("in_view", self.visibility > 0), ("visible", self.visibility == 2)):
@@ -94,8 +94,8 @@ def evaluate(
 ) -> Evaluation:
     """Run a detector over labelled images, such as `lib.training.samples.labelled_images` of a recording.
 
-    `detector` is a `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.  A ValueError if
-    there is no image.
+    `detector` is a `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.  Raises
+    ValueError if there is no image.
 
     >>> missed = LabelledImage("dark", np.zeros((90, 90, 3), np.uint8), np.full((3, 2), 30.0), np.full(3, 2))
     >>> evaluate(lambda images: Landmarks.none(len(images)), [missed]).scores.missed

@@ -1,7 +1,7 @@
 """Training a network: its configuration, batches, losses, optimiser, validation, checkpoints with exact resume.
 
 All randomness of step t comes from a generator seeded with (seed, t).  A run that was interrupted and resumed therefore
-equals one that was not, bit for bit on the CPU: the number of the step is the whole state of the generators.
+equals one that was not, bit for bit on the CPU: the step number determines all random numbers.
 """
 
 import copy
@@ -35,10 +35,10 @@ from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_
 from lib.training.samples import Samples, Source
 
 FORMAT = "microstereo.training"
-#: What a checkpoint keeps of a `Run` beside its tensors.
+#: Attributes of a `Run` that a checkpoint stores beside its tensors.
 _STATE = ("step", "seconds", "log", "loss_sum", "since")
 _OPTIMISERS = {"rmsprop": partial(torch.optim.RMSprop, alpha=0.99), "adamw": partial(torch.optim.AdamW, weight_decay=1e-4)}
-#: A killed training loses at most this much.
+#: Time between checkpoints, so the most that a killed training loses.
 _SAVE_EVERY_S = 50.0
 
 
@@ -48,14 +48,14 @@ class TrainingConfig:
 
     Attributes:
         optimiser: ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``.
-        schedule: Of the learning rate: ``"constant"``, or ``"cosine"`` after a warm-up.
+        schedule: Schedule of the learning rate: ``"constant"``, or ``"cosine"`` after a warm-up.
         ema: Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
         clip: Largest norm of the gradient; 0 = unlimited.
-        precision: ``"fp32"``, or ``"bf16"``: mixed precision where the processor computes in it; the loss is always float32.
-        sigma_px: Width of the target Gaussians in pixels of the network's input.
-        seed: Decides the first weights and every batch.
+        precision: ``"fp32"``, or ``"bf16"``: mixed precision if the processor supports it; the loss is always float32.
+        sigma_px: Standard deviation of the target Gaussians in pixels of the network's input.
+        seed: Determines the initial weights and every batch.
 
-    A ValueError for an unknown choice, or a number below 1 where at least 1 is needed.
+    Raises ValueError for an unknown choice, or a number below 1 where at least 1 is needed.
 
     >>> TrainingConfig(steps=1000, learning_rate=1e-3, schedule="cosine").rate(500)
     0.000505
@@ -82,7 +82,7 @@ class TrainingConfig:
         check(self, "steps batch_size validate_every", lambda v: v >= 1, "must be at least 1")
 
     def rate(self, step: int, spent: float = 0.0) -> float:
-        """Learning rate of a step; `spent` is the share of the time that has passed, if time ends the training."""
+        """Learning rate of a step; `spent` is the share of the time limit that has passed, if there is a limit."""
         if self.schedule == "constant":
             return self.learning_rate
         warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
@@ -90,9 +90,9 @@ class TrainingConfig:
         return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
 
     def changed(self, stored: dict[str, object]) -> list[str]:
-        """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.
+        """Names of the options that differ from a checkpoint's configuration, in which missing options have their defaults.
 
-        `validate_every` may differ between two sittings of one training.  Options that are gone must have been 0.
+        `validate_every` may differ when a training is resumed.  Options that no longer exist must be 0 in the checkpoint.
         """
         own, other = (json.loads(json.dumps(asdict(c))) for c in (self, TrainingConfig(type(self.network)())))
         other |= stored | {part: other[part] | stored.get(part, {}) for part in ("network", "augmentation")}
@@ -110,7 +110,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Training:
-    """A finished (or stopped) training: the network to use, one log row per validation, and its provenance."""
+    """The result of a finished or stopped training: the network, one log row per validation, and the provenance."""
 
     network: Network
     log: list[dict[str, float]]
@@ -118,9 +118,9 @@ class Training:
 
 
 def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> tuple[object, ...]:
-    """Images (n, h, w, 3) uint8, u (n, 3, 2) px, visibility (n, 3) of a step, and the generator that `prepared` goes on with.
+    """Draw images (n, h, w, 3) uint8, u (n, 3, 2) px, visibility (n, 3) of a step; also returns the generator for `prepared`.
 
-    `rank` is the number of the process among those that train together.
+    `rank` is the index of this process among those that train together.
     """
     rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
@@ -128,13 +128,13 @@ def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0)
 
 
 def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str = "cpu") -> Batch:
-    """What `draw_batch` gave, augmented on the device that trains."""
+    """Augment the result of `draw_batch` on the device that trains."""
     *arrays, rng = drawn
     return config.augmentation(_batch(*arrays, device), rng)
 
 
 def batches(draw: Callable[[int], tuple], steps: range, threads: int = 0) -> Iterator[tuple]:
-    """What `draw` gives for each step, in order.  So many `threads` draw ahead; without any, each is drawn when it is due.
+    """Yield ``draw(step)`` for each step, in order.  `threads` is the number of threads that draw ahead; 0 = none.
 
     >>> list(batches(lambda step: (step, step**2), range(3, 6), threads=2))
     [(3, 9), (4, 16), (5, 25)]
@@ -151,7 +151,7 @@ def batches(draw: Callable[[int], tuple], steps: range, threads: int = 0) -> Ite
 
 
 def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: torch.device | str = "cpu") -> Batch:
-    """As tensors; landmarks outside the image are absent."""
+    """Convert arrays to a batch, in which landmarks outside the image are absent."""
     if images.dtype != np.uint8:
         raise ValueError(f"images: a source draws uint8, got {images.dtype}.")
     images, u, visibility = (torch.as_tensor(part).to(device) for part in (images, u, visibility))
@@ -160,7 +160,7 @@ def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: to
 
 
 def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
-    """Squared distance of every stack's heatmaps from the Gaussians, scaled so that empty heatmaps cost 1.
+    """Squared error of every stack's heatmaps against the Gaussians, scaled so that empty heatmaps cost 1.
 
     It is the sum over cells divided by pi sigma^2 (the sum of a squared Gaussian of peak 1), the mean over the landmarks
     that count, and the mean over stacks (intermediate supervision).
@@ -178,8 +178,8 @@ def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px:
 def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
     """Negative log likelihood of an `OffsetNetwork`'s errors under Laplace distributions with the scales that it predicts.
 
-    A closeup has one visible landmark; without one, or without its label, it does not count.  The absolute error is smoothed
-    within 0.1 px.  Gross errors weigh little under it; divided by the scale, a sharp image weighs more than a blurred one.
+    A closeup without a visible, labelled landmark does not count.  The absolute error is smoothed within 0.1 px.  The Laplace
+    distribution gives gross errors little weight; its scale gives sharp images more weight than blurred ones.
     """
     (found,) = outputs
     own = (batch.visibility == 2) & batch.u.isfinite().all(-1)
@@ -200,9 +200,9 @@ def _loss(network: Network, outputs: Sequence[Tensor], batch: Batch, config: Tra
 def validate(network: Network, samples: Samples, config: TrainingConfig) -> dict[str, float]:
     """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
 
-    `peak` is the mean height of the heatmaps of visible landmarks; 1 is right.  `spread` is the standard deviation of the
-    predictions over that of the labels.  Near 0 they show that the network predicts nothing, or always the same.  An
-    `OffsetNetwork` has no peaks.
+    `peak` is the mean height of the heatmaps of visible landmarks, ideally 1; near 0, the network predicts nothing.  `spread`
+    is the standard deviation of the predictions divided by that of the labels; near 0, the network always predicts the same.
+    An `OffsetNetwork` has no `peak`.
     """
     network.eval()
     device = next(network.parameters()).device
@@ -229,7 +229,7 @@ def validate(network: Network, samples: Samples, config: TrainingConfig) -> dict
 
 
 def average(tensors: Sequence[Tensor], world: int) -> None:
-    """Replace tensors by their means over the processes."""
+    """Replace tensors, in place, by their means over the processes."""
     together = torch.cat([t.flatten() for t in tensors])
     dist.all_reduce(together)
     together /= world
@@ -238,14 +238,14 @@ def average(tensors: Sequence[Tensor], world: int) -> None:
 
 
 class Run:
-    """Weights, optimiser and log of a training under way, and their file."""
+    """The state of a training, which can be saved and restored: weights, optimiser, step and log."""
 
     def __init__(self, config: TrainingConfig, initial: Network | None = None):
         self.config = config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = copy.deepcopy(initial) if initial is not None else network_of(config.network)
-        # torchrun starts the processes that train together, and tells each by its environment how many they are.
+        # torchrun starts the processes that train together, and gives their number in the environment.
         self.rank, self.world = 0, int(os.environ.get("WORLD_SIZE", "1"))
         if self.world > 1:
             if not dist.is_initialized():
@@ -253,7 +253,7 @@ class Run:
             self.rank = dist.get_rank()
         gpu = f"cuda:{os.environ.get('LOCAL_RANK', '0') if self.world > 1 else 0}"
         self.device = torch.device(gpu if torch.cuda.is_available() else "cpu")
-        # A processor without such arithmetic imitates it, in eight times the time.
+        # A processor without bfloat16 arithmetic emulates it, which takes eight times as long.
         fast = self.device.type == "cuda" or any(map(torch.cpu.get_capabilities().get, ("avx512_bf16", "amx_bf16")))
         self.mixed = config.precision == "bf16" and fast
         self.network.to(self.device, memory_format=torch.channels_last)
@@ -264,7 +264,7 @@ class Run:
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
     def advance(self, batch: Batch, spent: float = 0.0) -> None:
-        """One step on a batch on the device; `spent` as in `TrainingConfig.rate`."""
+        """Train one step on a batch, which must be on the device; `spent` as in `TrainingConfig.rate`."""
         self.network.train()
         self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step, spent)
         images = batch.images.contiguous(memory_format=torch.channels_last)
@@ -284,7 +284,7 @@ class Run:
             nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         self.optimiser.step()
         if self.average is not None:
-            # A young average must not remember the random start.
+            # The decay is smaller in the first steps, so that the average forgets the random initial weights.
             decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
             means, values = (network.state_dict().values() for network in (self.average, self.network))
             for mean, value in zip(means, values, strict=True):
@@ -293,15 +293,15 @@ class Run:
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
     def _graphed(self, images: Tensor) -> Callable[[Tensor], list[Tensor]]:
-        """The network as CUDA graphs: a step is a thousand small kernels, which take longer to launch than to run."""
-        before = copy.deepcopy(self.network.state_dict())  # capturing moves the statistics of batch normalisation
-        torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)  # of a capture, that says nothing
+        """Capture the network as CUDA graphs: a step has a thousand kernels, which take longer to launch than to run."""
+        before = copy.deepcopy(self.network.state_dict())  # a capture changes the statistics of batch normalisation
+        torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)  # meaningless for a capture
         graphed = torch.cuda.make_graphed_callables(copy.copy(self.network), (images,))
         self.network.load_state_dict(before)
         return graphed
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
-        """Write all that `restore` needs to go on."""
+        """Write everything that `restore` needs."""
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         if self.average is not None:
             tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
@@ -311,18 +311,18 @@ class Run:
         write_checkpoint(path, tensors, {"format": FORMAT, "config": asdict(self.config), "provenance": provenance} | state)
 
     def restore(self, path: Path, provenance: dict[str, object]) -> None:
-        """Continue from a checkpoint; `provenance` is completed by what it was begun from."""
+        """Load the state from a checkpoint, and complete `provenance`.  Raises ValueError if it is another training's."""
         tensors, metadata = read_checkpoint(path, FORMAT)
         changed, kept = self.config.changed(metadata["config"]), metadata["provenance"]
         processes = kept.get("processes", 1)
         for differs, how in (
-            (changed, f"belongs to a training with another {', '.join(changed)}"),
-            (kept["data"] != provenance["data"], "was trained on other data (fingerprint differs)"),
-            (provenance.get("initial") not in (None, kept.get("initial")), "was begun from other weights"),
-            (processes != self.world, f"was begun by {processes} process(es), now {self.world}; start as many"),
+            (changed, f"belongs to a training with another {', '.join(changed)};"),
+            (kept["data"] != provenance["data"], "was trained on other data (fingerprint differs);"),
+            (provenance.get("initial") not in (None, kept.get("initial")), "was begun from other weights;"),
+            (processes != self.world, f"was begun by {processes} process(es), now {self.world}; start as many, or"),
         ):
             if differs:
-                raise ValueError(f"{path}: {how}, or use another folder.")
+                raise ValueError(f"{path}: {how} use another folder.")
         provenance |= {key: kept[key] for key in ("initial", "before", "metrics") if key in kept}
         self.network.load_state_dict(_part(tensors, "network."))
         if self.average is not None:
@@ -337,16 +337,16 @@ def train(
     config: TrainingConfig, source: Source, validation: Samples, folder: str | Path | None = None, *,
     initial: Training | None = None, max_seconds: float | None = None, progress: bool | Callable[[float], None] = True,
 ) -> Training:  # fmt: skip
-    """Train a network; an interrupted training in `folder` is resumed.
+    """Train a network, or resume an interrupted training in `folder`.
 
     Args:
-        source, validation: Training and held-out images; validation is never trained on.
-        folder: Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
-        initial: Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
-        max_seconds: Stop (resumably) after this long; a cosine schedule ends then.
-        progress: Whether to show a bar, or a function that is called with the part that is done.
+        source, validation: Training images and held-out images.
+        folder: Where ``last.safetensors`` (weights, average, optimiser, step, log) is written; None = nothing is written.
+        initial: A training from whose weights to start, for fine-tuning; its provenance is kept under ``before``.
+        max_seconds: Stop after this time, in s; a cosine schedule ends then.  The training can be resumed.
+        progress: True = show a progress bar.  A function is called with the share that is done.
 
-    A ValueError for an empty data set, an `initial` of another network, or a folder that holds another training.
+    Raises ValueError for an empty data set, an `initial` of another network, or a folder that holds another training.
     """
     if not len(source):
         raise ValueError("source: must not be empty; give labelled images.")
@@ -365,7 +365,7 @@ def train(
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
     began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
-    # A GPU learns faster than one thread draws.
+    # A GPU trains faster than one thread draws.
     threads = max(1, cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - 1) if run.device.type == "cuda" else 0
     drawn = batches(partial(draw_batch, source, config, rank=run.rank), range(run.step, config.steps), threads)
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
@@ -398,7 +398,7 @@ def train(
 
 
 def load_training(path: str | Path) -> Training:
-    """The network of a training's checkpoint, finished or not."""
+    """Load the network from a training's checkpoint, finished or not."""
     tensors, metadata = read_checkpoint(path, FORMAT)
     prefix = "average." if any(name.startswith("average.") for name in tensors) else "network."
     network = load_network(path, metadata["config"]["network"], tensors, prefix).eval()

@@ -1,4 +1,4 @@
-"""Labelled images: one by one from a recording, in memory, and mixed."""
+"""Labelled images: one by one from a recording, all in memory, or mixed from two sources."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -14,7 +14,7 @@ from lib.recordings.annotations import CLICK_SD_PX
 class LabelledImage(NamedTuple):
     """An image (h, w, 3) uint8 RGB and its landmarks base, tip_1, tip_2: u (3, 2) px and visibility (3,).
 
-    Visibility is 2 visible, 1 hidden, 0 not in the frame.  A landmark that is NaN in `u` and not 0 here is unlabelled.
+    Visibility is 2 visible, 1 hidden, 0 not in the frame.  A landmark is unlabelled if `u` is NaN and its visibility not 0.
     `sd_px` (3,) or a number is the standard deviation of the labels along each axis.
     """
 
@@ -31,9 +31,9 @@ class LabelledImage(NamedTuple):
 
 
 def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
-    """Left and right images of every `every`-th frame with labels: the truth of a simulated one, else annotated images alone.
+    """Yield the labelled left and right images of every `every`-th frame: by the truth of a simulation, else by annotations.
 
-    A ValueError if the recording has neither.
+    Images without annotations are skipped.  Raises ValueError if the recording has neither.
     """
     if (labels := recording.truth or recording.annotations) is None:
         raise ValueError(f"{recording.name}: it has neither truth/ nor annotations.json; give a labelled recording.")
@@ -48,7 +48,7 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
 
 
 def shown_by_coco(visibility: np.ndarray) -> np.ndarray:
-    """Visibility of a `LabelledImage` from that of annotations: 0 there is "not labelled", and -1 is absent, which is 0 here.
+    """Convert the visibility of annotations (0 unlabelled, -1 absent) to that of a `LabelledImage`, where absent is 0.
 
     >>> shown_by_coco(np.array([-1, 0, 1, 2])).tolist()
     [0, 1, 1, 2]
@@ -57,18 +57,18 @@ def shown_by_coco(visibility: np.ndarray) -> np.ndarray:
 
 
 class Source:
-    """Labelled images of one size that training draws from: a data class whose first field has one entry an image."""
+    """Labelled images of one size from which training draws: a data class whose first field has one entry per image."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image (h, w, 3) uint8, landmarks (3, 2) px, visibility (3,)."""
+        """Draw image `index`: (h, w, 3) uint8, landmarks (3, 2) px, visibility (3,)."""
         raise NotImplementedError
 
     @property
     def fingerprint(self) -> str:
-        """Of all fields: the images, their labels, and how images are drawn from them."""
+        """Digest of all fields: the images, their labels, and how images are drawn from them."""
         parts = []
         for value in (getattr(self, field.name) for field in fields(self)):
             if isinstance(value, np.ndarray):
@@ -82,7 +82,7 @@ class Source:
 class Samples(Source):
     """Labelled images in memory, (n, h, w, 3) uint8 RGB, with u (n, 3, 2) and visibility (n, 3) as in `LabelledImage`.
 
-    A ValueError for an empty set, arrays of other shapes, or no visible landmark at all.
+    Raises ValueError for an empty set, arrays of other shapes, or no visible landmark at all.
     """
 
     images: np.ndarray
@@ -101,7 +101,7 @@ class Samples(Source):
 
     @classmethod
     def drawn(cls, source: Source, seed: int = 0) -> Self:
-        """One image drawn for each entry of `source`: validation samples."""
+        """Draw one image for each entry of `source`, for validation."""
         rng = np.random.default_rng(seed)
         return cls(*map(np.stack, zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)))
 
@@ -111,7 +111,7 @@ class Samples(Source):
 
 @dataclass(frozen=True)
 class Mixed(Source):
-    """Images of one source in a `share` of the draws, else of another, which a network must not forget."""
+    """Draws from `own` with probability `share`, else from `other`, whose images a network must not forget."""
 
     own: Source
     other: Source

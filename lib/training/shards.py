@@ -1,9 +1,9 @@
 """Training data on disk: .npz shards of simulated frames, cut to what the detector's stages see.
 
-The detector learns from ``scenes`` (whole frames, small, the wide population, some without a tool) and ``closeups`` (crops
-round a landmark); its doubt is fitted on ``held_out`` (whole frames in full resolution, with families that training never
-draws).  All come from `lib.simulator.population.sample`, whose eyes and tools no test recording uses.  Shards are written
-whole or not at all, so that `generate` can be stopped at any time and continues where it stopped.
+The networks are trained on ``scenes`` (whole frames, small, of the wide population, some without a tool) and ``closeups``
+(crops around a landmark).  The error models are fitted on ``held_out`` (whole frames in full resolution, with families that
+training never draws).  All come from `lib.simulator.population.sample`, whose eyes and tools no test recording uses.  Shards
+are written whole or not at all, so that `generate` can be stopped at any time and continues where it stopped.
 """
 
 import zipfile
@@ -30,17 +30,17 @@ SCENE_PX = 512
 _SEEDS = {"closeups": (5, 77), "scenes": (6,), "held_out": (7,)}
 #: Side of the crops that closeups are cut from.
 CLOSEUP_CROP_PX = 160
-#: Closeups in a shard, and the most proposals that are kept of a scene.
+#: Number of closeups in a shard, and largest number of proposals that are kept for a scene.
 CLOSEUPS, PROPOSALS = 1024, 12
-#: Shards of whole scenes: how many, and the share of each population.
+#: Shards of whole scenes: number of scenes, and share of each population.
 SCENES = {
     "scenes": (64, {"training": 0.5, "near": 0.3, "empty": 0.2}),
     "held_out": (16, {"validation": 0.6, "near": 0.2, "empty": 0.2}),
 }
-#: Sizes of held-out scenes: what stage sees what must not depend on them.
+#: Sizes of held-out scenes.  They differ, because the error models must hold for frames of any size.
 HELD_OUT_SIZES = ((1920, 1080), (1280, 720), (960, 540))
-#: A crop is rendered with its landmark anywhere within a JPEG block of this many pixels.  Were its place in the block always
-#: the same, a network would learn to read it off the blocks: a quarter of its error would vanish, and return on other images.
+#: A crop is rendered with its landmark anywhere within a JPEG block of this many pixels.  If the place in the block were
+#: constant, a network would learn it from the blocks: a quarter of its error would vanish, and return on other images.
 BLOCK_PX = 16
 
 
@@ -50,9 +50,9 @@ def generate(
 ) -> None:  # fmt: skip
     """Write the first `shards` shards of a kind into `folder`, except those that exist.
 
-    A shard depends on its kind, its number and the `photographs` alone, which are the ground of some scenes that train.
-    Crops are rendered alone, each of an eye and a tool of its own: many times as many scenes a second.  `workers` processes
-    share the work (None: all cores).
+    A shard depends only on its kind, its number and the `photographs`, which are the ground of some training scenes.  Each
+    crop shows an eye and a tool of its own and is rendered without the rest of the frame, which is many times faster.
+    `workers` is the number of processes; None = one per core.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i, photographs) for i in range(shards)}
@@ -71,8 +71,8 @@ def make_shard(path: Path, kind: str, index: int, photographs: Sequence[Path] = 
     sizes = HELD_OUT_SIZES if kind == "held_out" else ((SCENE_PX, round(SCENE_PX * 9 / 16)),)
     textures = VALIDATION_TEXTURE_SEEDS if kind == "held_out" else TEXTURE_SEEDS
     names = rng.choice(list(shares), n, p=list(shares.values())).tolist()
-    how = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
-    drawn = (sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **how) for name in names)
+    options = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
+    drawn = (sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **options) for name in names)
     ends, jpegs, u, visibility = packed(LabelledImage(name, *one) for name, one in zip(names, drawn, strict=True))
     with whole(path) as partial:
         np.savez(partial, jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
@@ -84,17 +84,17 @@ def _write_closeups(path: Path, rng: np.random.Generator, photographs: Sequence[
     landmark, rendered_px = rng.integers(3, size=n), side_px + BLOCK_PX
     for i, k in enumerate(landmark):
         while not seen[i, k]:
-            # A third is of the reference rig, where the last tenth of a pixel counts.
+            # A third shows the reference rig, where the last tenth of a pixel counts.
             population = "near" if rng.random() < 1 / 3 else "training"
-            how = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
-            image, at, seen[i] = sample(rng, crop_px=rendered_px, photographs=photographs, **how)
-        crops[i], u[i] = square_round(image, at, k, side_px)  # the landmark is not in the middle where the field ends
+            rest = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
+            image, at, seen[i] = sample(rng, crop_px=rendered_px, photographs=photographs, **rest)
+        crops[i], u[i] = square_round(image, at, k, side_px)  # at the field's border the landmark is off-centre
     with whole(path) as partial:
         np.savez(partial, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)
 
 
 def square_round(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """The square round landmark k, and the landmarks in its pixels."""
+    """Cut the square around landmark k; returns it and the landmarks in its pixels."""
     corner = np.round(u[k] - (side_px - 1) / 2)
     return cut(image, np.column_stack([np.eye(2), -corner]), side_px), u - corner
 
@@ -108,7 +108,7 @@ def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
-    """Arrays of the (first) shards of a kind, joined; an error names a missing, corrupt or differently sized shard."""
+    """Read and join the arrays of the (`first`) shards of a kind; errors name a missing, corrupt or differently sized one."""
     if not (found := sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]):
         raise FileNotFoundError(f"{folder}: no shard {kind}_*.npz; make some with `python3 -m lib train generate`.")
     shards = [_read(path, names) for path in found]
@@ -119,7 +119,7 @@ def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int 
 
 
 def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:
-    """Labelled images, `long_side_px` long at most, as (ends (n,), JPEGs in a row, u (n, 3, 2), visibility (n, 3))."""
+    """Encode images, at most `long_side_px` long, as (ends (n,), joined JPEGs, u (n, 3, 2) px, visibility (n, 3))."""
     parts = []
     for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]
@@ -133,16 +133,16 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> 
 
 
 def read_scenes(folder: str | Path) -> tuple[np.ndarray, ...]:
-    """What `packed` gives, of all shards of scenes in a folder."""
+    """Read all shards of scenes in a folder, as `packed` returns them."""
     parts = read_shards(folder, "scenes", ("jpegs", "u", "visibility"))
     ends = (_read(path, ("jpeg_ends",))[0] for path in sorted(Path(folder).glob("scenes_*.npz")))
     return np.cumsum(np.concatenate([np.diff(own, prepend=0) for own in ends])), *parts
 
 
 def propose(folder: str | Path, detector: str | Path | None = None, *, workers: int | None = None) -> None:
-    """Write what a detector's first stage takes for tools in the scenes of a folder, except where that is known.
+    """Write the candidates that a detector's first stage proposes in the scenes of a folder, for shards without proposals.
 
-    Most are none: they are the negatives that teach the second stage most.  `detector`: as `Detector.load` takes it.
+    Most are not tools: they are the most useful negatives for the second stage.  `detector` is as for `Detector.load`.
     """
     jobs = {_proposals(path): (path, detector) for path in Path(folder).glob("scenes_*.npz")}
     for _, error in run_jobs(make_proposals, jobs, workers=workers, title="Searching scenes", unit="shard"):
@@ -151,7 +151,7 @@ def propose(folder: str | Path, detector: str | Path | None = None, *, workers: 
 
 
 def make_proposals(path: Path, scenes: Path, detector: str | Path | None) -> None:
-    """Search the scenes of one shard, half of them disguised; write u (n, PROPOSALS, 3, 2) px, NaN beyond those there are."""
+    """Search the scenes of one shard, half of them disguised; write u (n, PROPOSALS, 3, 2) px, NaN if there are fewer."""
     searching, rng = Detector.load(detector), np.random.default_rng([8, int(scenes.stem[-4:])])
     jpegs, ends, u, visibility = _read(scenes, ("jpegs", "jpeg_ends", "u", "visibility"))
     found = np.full((len(u), PROPOSALS, 3, 2), np.nan)
@@ -172,19 +172,19 @@ def _proposals(scenes: Path) -> Path:
 
 
 def read_proposals(folder: str | Path) -> np.ndarray | None:
-    """What `propose` found in a folder's scenes, (n, PROPOSALS, 3, 2) px, NaN where it did not look; None if nowhere."""
+    """Read the proposals for a folder's scenes, (n, PROPOSALS, 3, 2) px; NaN for shards without, None if all are without."""
     known, parts = False, []
     for path in sorted(Path(folder).glob("scenes_*.npz")):
         own, n = _proposals(path), len(_read(path, ("jpeg_ends",))[0])
         known |= own.is_file()
         parts.append(_read(own, ("u",))[0] if own.is_file() else np.full((n, PROPOSALS, 3, 2), np.nan))
         if len(parts[-1]) != n:
-            raise ValueError(f"{own}: is of other scenes than {path.name}; delete it and call `lib train propose` again.")
+            raise ValueError(f"{own}: made for other scenes than {path.name}; delete it and run `lib train propose` again.")
     return np.concatenate(parts) if known else None
 
 
 def validation_images(folder: str | Path, kind: str = "held_out") -> Iterator[LabelledImage]:
-    """Full frames that no network is trained on, for `lib.training.evaluation`: ``"held_out"``, or ``"validation"``."""
+    """Yield full frames that no training saw, for `lib.training.evaluation`; `kind` is ``"held_out"`` or ``"validation"``."""
     for path in sorted(Path(folder).glob(f"{kind}_*.npz")):
         jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):

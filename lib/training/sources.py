@@ -1,4 +1,4 @@
-"""What the stages are trained on: frames of any size, windows round the tool, and closeups of a landmark."""
+"""Training data of the stages: frames of any size, windows around the tool, and closeups of a landmark."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,33 +17,33 @@ from lib.training.appearance import disguised
 from lib.training.drawings import bent, drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 
-#: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
-#: parts of them, which costs a third, since a frame is mostly background.
+#: Input size (width, height) of the first stage, whose width is the longer side of a shrunken frame.  It is trained on parts
+#: of a frame, of the second size, which takes a third of the time, since a frame is mostly background.
 FRAME_PX, PART_PX = (320, 192), (160, 128)
 _TOOL_SIZE = windows.TOOL_PX, windows.TOOL_PX
-#: Drawings are made on a part of the frame of this (width, height): on all of it they would take most of the time.
+#: Drawings are made on a part of the frame of this (width, height): drawing on a whole frame would dominate the time.
 _DRAWN_PX = 320, 180
-#: Shorter tools are no target, they have no loss.
+#: Shorter tools have no loss, in pixels of the network's input.
 SHORTEST_PX = 5.0
-#: Nor are tools in an image whose grey values spread less.
+#: Tools in an image whose values have a smaller standard deviation (of 255) have no loss either.
 FLAT = 5.0
-#: By how much a window is turned (rad), magnified (log) and shifted (its pixels) if it still shows the tool, and if not.
+#: Errors of a window's angle (rad), scale (log) and position (its pixels) with which it shows the tool, and does not.
 _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8, 1.6), (60.0, 150.0))
-#: Share of the windows that are where a first stage saw a tool, of scenes in which that is known.
+#: Share of the windows that are cut at a proposal of a first stage, in scenes that have proposals.
 _PROPOSED = 0.4
-#: A closeup shows a part of the tool: blur and things in front are drawn as for a tool of this length.
+#: A closeup shows only a part of the tool.  Its blur and occluders are drawn as for a tool of this length.
 _DISGUISE_PX = 40.0
-#: Drawn tools in closeups: their length, and the blur of lens and sensor, px.
+#: Drawn tools in closeups: ranges of their length, and of the blur by lens and sensor, px.
 _DRAWN_LENGTH_PX, _DRAWN_BLUR_PX = (90.0, 450.0), (0.4, 3.0)
 
 
 @dataclass(frozen=True)
 class SceneSource(Source):
-    """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
+    """Frames as joined JPEGs, which end at bytes `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
-    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing, `bent` that of the others whose
-    jaws are bent (both in `drawings.py`), `weight` (n, 3) that of the draws in which a label counts.
+    In frames without a tool all landmarks have visibility 0.  The others are shares: `disguise` of the draws whose look is
+    changed, `drawn` of the draws whose tool is a drawing, `bent` of the remaining draws whose jaws are bent (both in
+    `drawings.py`), and `weight` (n, 3) of the draws in which a label counts.
     """
 
     ends: np.ndarray
@@ -57,16 +57,16 @@ class SceneSource(Source):
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
-        """From the shards of a folder, to train with."""
+        """Load the shards of a folder, for training."""
         return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35, bent=0.4)
 
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
-        """From labelled images of any size; `still` shows each as the detector sees it, for validation."""
+        """Make a source from labelled images of any size; for validation `still`: unchanged, as the detector sees them."""
         return cls(*shards.packed(images, shards.SCENE_PX), disguise=0.0 if still else 0.5, weight=weight)
 
     def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The frame, or a drawn tool on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
+        """The frame, or a drawn tool on a ground made from it, with landmarks (3, 2) px, visibility and weight (3,)."""
         image, *labels = self.frame(index)
         if self.drawn and rng.random() < self.drawn:
             x, y = rng.integers(0, np.maximum(np.subtract(image.shape[1::-1], _DRAWN_PX), 0), endpoint=True)
@@ -78,12 +78,12 @@ class SceneSource(Source):
         return image, *labels
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The frame as it is, with landmarks (3, 2), visibility and weight (3,)."""
+        """The stored frame, with landmarks (3, 2) px, visibility and weight (3,)."""
         image = cv2.imdecode(self.jpegs[self.ends[index - 1] if index else 0 : self.ends[index]], cv2.IMREAD_COLOR_RGB)
         return image, self.u[index], self.visibility[index], np.ones(3) if self.weight is None else self.weight[index]
 
     def _seen(self, scene, centre: np.ndarray, angle: float, size: tuple[int, int], zoom: float, rng: np.random.Generator):
-        """A window of a scene, disguised or not; landmarks too small to see have no loss."""
+        """Cut a window of a scene and perhaps disguise it; landmarks of a tool that is too small to see become unlabelled."""
         image, u, visibility, weight = scene
         matrix = windows.window_from_image(centre, angle, size, zoom)
         scale = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
@@ -106,13 +106,13 @@ def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
 
 
 class FrameSource(SceneSource):
-    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a sixth show no landmark."""
+    """Frames for the first stage: rotated, zoomed, shifted and mirrored.  A sixth of them show no landmark."""
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         frame, u, visibility, _ = scene = self.scene(index, rng)
         fit, length = FRAME_PX[0] / max(frame.shape[:2]), _length_px(u, visibility)
         middle = (np.array(frame.shape[1::-1]) - 1) / 2
-        if not self.disguise:  # as `Detector` sees it
+        if not self.disguise:  # for validation, as `Detector` sees it
             return self._seen(scene, middle, 0.0, FRAME_PX, fit, rng)
         zoom = np.clip(fit * np.exp(rng.normal(0, 0.45)), 0.4 * fit, None)
         if np.isfinite(length):
@@ -127,10 +127,10 @@ class FrameSource(SceneSource):
 
 @dataclass(frozen=True)
 class ToolSource(SceneSource):
-    """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
+    """Upright windows of `windows.TOOL_PX` around the tool, with the previous stage's errors of position, angle and scale.
 
-    Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
-    Where it is known what a first stage took for tools, four in ten show that: `proposals` (n, m, 3, 2) px, NaN if fewer.
+    Three in ten show no tool in upright pose and right size.  Their peaks must be low, since the heights decide between
+    candidates.  In scenes with `proposals` (n, m, 3, 2) px of a first stage, padded with NaN, four in ten show a proposal.
     """
 
     proposals: np.ndarray | None = None
@@ -155,7 +155,7 @@ class ToolSource(SceneSource):
         return _mirrored(*self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng), rng if self.disguise else None)
 
     def _proposed(self, scene, tool: np.ndarray, rng: np.random.Generator):
-        """The window of a tool (3, 2) that a first stage saw, labelled if that is the tool, and else without one."""
+        """The window of a tool (3, 2) px that a first stage proposed, labelled if it shows the tool, else without one."""
         (centre, own), (angle, direction) = windows.tool_pose(np.stack([tool, scene[1]]))
         zoom = windows.tool_zoom(max(_length_px(tool, np.ones(3)), SHORTEST_PX)) * np.exp(rng.normal(0, 0.1))
         centre, angle = centre + rng.normal(0, 4, 2) / zoom, angle + rng.normal(0, 0.1)
@@ -168,7 +168,7 @@ class ToolSource(SceneSource):
         return _mirrored(image, u if shows else np.full((3, 2), np.nan), visibility, rng)
 
     def _elsewhere(self, scene, centre: np.ndarray, angle: float, length: float, rng: np.random.Generator):
-        """A window anywhere, or one by the tool that is turned, of another scale or shifted too far."""
+        """A window anywhere, or one near the tool with too large an error of angle, scale or position."""
         wrong = np.zeros(3, bool)
         if np.isfinite(angle + length) and rng.random() < 0.7 * scene[3].min():  # not by a doubtful label
             wrong = rng.random(3) < 0.4
@@ -184,11 +184,11 @@ class ToolSource(SceneSource):
         if wrong.any():
             return image, np.full((3, 2), -float(windows.TOOL_PX)), np.zeros(3, int)
         seen = inside(at, _TOOL_SIZE) & (visibility > 0)
-        return image, np.where(seen[:, None], np.nan, at), visibility  # another scale or direction is no example
+        return image, np.where(seen[:, None], np.nan, at), visibility  # a tool of any other scale or direction has no loss
 
 
 def _mirrored(image, u, visibility, rng: np.random.Generator | None):
-    """Top and bottom exchanged every second time; the tips are too."""
+    """Exchange top and bottom, and so the tips, with probability 1/2; never without `rng`."""
     if rng is None or rng.random() < 0.5:
         return image, u, visibility
     u = np.column_stack([u[:, 0], image.shape[0] - 1 - u[:, 1]])[[0, 2, 1]]
@@ -197,18 +197,18 @@ def _mirrored(image, u, visibility, rng: np.random.Generator | None):
 
 @dataclass(frozen=True)
 class CloseupSource(Source):
-    """Closeups of visible landmarks, displaced as the stage before or the frame before may place them, of stretched tools.
+    """Closeups of visible landmarks, displaced by the errors of the previous stage or frame, of stretched tools.
 
-    Stretching and shearing an image keeps its labels true and makes many tools of one.
+    Stretching and shearing an image makes many tools from one, and the labels stay right.
 
     Attributes:
-        shifts_px, shift_shares: Standard deviations of the error of place, image pixels at reference scale, and their shares.
+        shifts_px, shift_shares: Standard deviations of the error of position, image pixels at closeup scale 1; their shares.
         turn_rad, length: Standard deviations of the errors of direction and of the logarithm of the tool's length.
-        alone: Share of closeups whose direction is that to one tip, as if the other one were missing.
-        stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
-        motion_px: Standard deviation of the movement that blurs half of the closeups, in their pixels along x and y.
+        alone: Share of closeups whose direction is from the base to one tip, as if the other tip were missing.
+        stretch, shear: Standard deviations of the logarithms of the stretches along and across the tool, and of the shear.
+        motion_px: Standard deviation along x and y of the motion that blurs half of the closeups, in their pixels.
         disguise: Share of closeups whose appearance is changed.
-        drawn: Share of closeups that show a drawn tool on a ground made of the crop (`drawings.py`).
+        drawn: Share of closeups that show a drawn tool on a ground made from the crop (`drawings.py`).
         weight: (n,) share of the draws in which a label counts.
     """
 
@@ -231,14 +231,14 @@ class CloseupSource(Source):
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
-        """From a folder's shards, the landmarks that are not hidden, to train with."""
+        """Load the visible landmarks of a folder's shards, for training."""
         parts = shards.read_shards(folder, "closeups", ("crops", "crop_u", "crop_visibility", "crop_landmark"))
         seen = parts[2][np.arange(len(parts[3])), parts[3]] == 2
         return cls(*(parts if seen.all() else (part[seen] for part in parts)), drawn=0.3)
 
     @classmethod
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
-        """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
+        """Make a source from labelled images of any size; for validation `still`: not stretched, blurred or disguised."""
         usable = [np.isfinite(one.u).all(1) & (one.visibility == 2) & np.isfinite(tool_length_px(one.u)) for one in images]
         if not len(which := np.argwhere(usable)):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
@@ -249,9 +249,9 @@ class CloseupSource(Source):
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A closeup; only its own landmark counts as visible."""
+        """Draw a closeup, in which only its own landmark counts as visible."""
         k = self.landmark[index]
-        # A crop ends before a turned closeup's corners do.  Where it ends must not tell where its middle was.
+        # A rotated closeup's corners lie outside the crop.  Shift the crop, so that its border does not reveal its centre.
         x, y = rng.integers(0, shards.BLOCK_PX, 2, endpoint=True)
         h, w = (side - shards.BLOCK_PX for side in self.crops.shape[1:3])
         crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)

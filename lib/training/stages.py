@@ -1,4 +1,4 @@
-"""The detector's stages: what each learns from, and how; fine-tuning on a user's labelled frames; the shipped detector."""
+"""The detector's stages: training data and configuration, fine-tuning on labelled frames, and assembly to a detector."""
 
 import json
 import threading
@@ -32,18 +32,18 @@ from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled
 from lib.training.shards import validation_images
 from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
-#: The stages that are trained, in the order of their use, and the channels of the shipped networks.
+#: The stages that are trained, in the order of their use, and the number of channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
-#: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
+#: Standard deviation of a label, as a share of the tool's length, at which its weight in a stage's training is one half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
-#: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
+#: Fine-tuning beside simulated frames: share of the draws that are labelled frames, and share of these with a changed look.
 _OWN_SHARE, _OWN_DISGUISE = 0.75, 0.2
 _RATES = {"frame": 5e-4, "tool": 1e-3, "closeup": 5e-4}  # chosen on two simulated recordings of the validation families
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
 def stage_config(stage: str, *, preset: str = "best", features: int | None = None) -> TrainingConfig:
-    """How a stage of the shipped detector is trained.
+    """The configuration with which a stage of the shipped detector is trained.
 
     >>> stage_config("tool").network.features
     48
@@ -52,7 +52,7 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
     if stage == "closeup":
         config = replace(config, augmentation=AUGMENTATIONS["closeups"])
         return replace(config, network=OffsetConfig(features), batch_size=64, clip=2.0)
-    config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.998)  # what is drawn is changed already
+    config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.998)  # the sources augment what they draw
     if stage == "frame":
         return replace(config, network=HourglassConfig(features, depth=3, growth=1.75), batch_size=16)
     return replace(config, network=HourglassConfig(features, growth=1.4))
@@ -64,7 +64,7 @@ def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:
 
 
 def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
-    """What a stage sees of held-out images; of those with a tool in view, since the others have nothing to measure."""
+    """The inputs of a stage for the held-out images with a landmark in view; the others have nothing to measure."""
     if not (shown := [one for one in images if (np.isfinite(one.u).all(1) & (one.visibility == 2)).any()]):
         raise ValueError(f"{stage}: no held-out image shows a landmark; label some, or `python3 -m lib train generate`.")
     return Samples.drawn(_SOURCES[stage].of(shown, still=True))
@@ -79,28 +79,28 @@ def finetune(
 
     Args:
         images, held_out: Images of any size.  Consecutive frames are alike, so hold out whole recordings, or the end of one.
-            Each needs a labelled base and a labelled tip; others are left out.  A label counts half if its deviation is
-            `LABEL_SD` of the tool's length.
-        folder: Keeps the checkpoints, from which the same call continues.
-        simulated: Folder of `generate`'s shards; a quarter of what is drawn then comes from there, and their held-out frames
-            help to fit the doubt, so that the networks do not forget tools and eyes that the labelled frames do not show.
-            Or full frames, of which every third helps to fit the doubt and the others to train.
-        steps, minutes: Steps of each stage; training ends after `minutes`, each stage having had its share.
-        progress: Whether to show a bar, or a function that is called with the stage and the part done.
+            Images without a labelled base and a labelled tip are left out.  A label has weight 1/2 if its standard deviation
+            is `LABEL_SD` of the tool's length.
+        folder: Where the checkpoints are written; the same call continues from them.
+        simulated: Folder of `generate`'s shards.  A quarter of the draws then comes from there, so that the networks do not
+            forget tools and eyes that the labelled frames do not show; its held-out frames are added to `held_out` for the
+            error models.  Or full frames, of which every third is for the error models and the others are for training.
+        steps, minutes: Number of steps of each stage; time limit for all of them, which they share.
+        progress: True = show a bar for each stage.  A function is called with the stage and the share that is done.
 
-    A ValueError if there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector has
-    no error models yet.
+    Raises ValueError if there is no usable image, or if fewer than 20 landmarks are found in the held-out images and the
+    detector has no error models yet.
     """
     images, held_out = ([one for one in part if np.isfinite(tool_length_px(one.u))] for part in (images, held_out))
     for kind, part in (("training", images), ("validation", held_out)):
         if not part:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
     relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u) for one in images])
-    doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
+    extra_held_out = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
     began, names, stopped = time.perf_counter(), list(detector.networks), threading.Event()
     bars = {stage: tqdm(total=1.0, desc=stage, disable=progress is not True, bar_format="{l_bar}{bar}") for stage in names}
 
-    def told(stage: str, part: float) -> None:
+    def report(stage: str, part: float) -> None:
         if stopped.is_set():
             raise InterruptedError(f"{stage}: the training was interrupted.")
         bars[stage].update(part - bars[stage].n)
@@ -108,7 +108,7 @@ def finetune(
             progress(stage, part)
 
     def trained(lane: list[str]) -> dict[str, Network]:
-        """The stages of a thread, one after the other, each for the same time."""
+        """Train the stages of a thread one after the other, each for the same time."""
         found = {}
         for number, stage in enumerate(lane):
             own = _SOURCES[stage].of(images, weight=1 / (1 + (relative_sd / LABEL_SD[stage]) ** 2))
@@ -122,11 +122,11 @@ def finetune(
             config = replace(config, learning_rate=_RATES[stage], ema=0.995)
             start = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")})
             left = None if minutes is None else (60 * minutes - (time.perf_counter() - began)) / (len(lane) - number)
-            how = {"initial": start, "max_seconds": left, "progress": partial(told, stage)}
-            found[f"{stage}_network"] = train(config, source, _still(stage, held_out), Path(folder) / stage, **how).network
+            rest = {"initial": start, "max_seconds": left, "progress": partial(report, stage)}
+            found[f"{stage}_network"] = train(config, source, _still(stage, held_out), Path(folder) / stage, **rest).network
         return found
 
-    # A second thread of torch's own makes small steps hardly faster, far slower on a busy machine.  A GPU is busy with one.
+    # More threads in torch make small steps hardly faster, on a busy machine far slower.  One stage keeps a GPU busy.
     threads = 1 if torch.cuda.is_available() else min(cores(), len(names))
     networks = {}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
@@ -137,20 +137,20 @@ def finetune(
         except BaseException:
             stopped.set()
             raise
-    then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
-    tuned = replace(detector, **networks, metadata=detector.metadata | then)
-    tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
+    added = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
+    tuned = replace(detector, **networks, metadata=detector.metadata | added)
+    tuned = fit_error_models(tuned, [*held_out, *extra_held_out], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:
         return tuned
-    # Held-out images say whether the closeups gained by a short training.
-    ways = tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | old)
-    scores = {way: evaluate(way, held_out).scores for way in ways}
-    return max(scores, key=lambda way: scores[way].auc + scores[way].pck_0_01)  # near landmarks decide as much as all do
+    # Held-out images decide whether the short training improved the closeups.  The smallest errors weigh as much as all.
+    choices = tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | old)
+    scores = {choice: evaluate(choice, held_out).scores for choice in choices}
+    return max(scores, key=lambda choice: scores[choice].auc + scores[choice].pck_0_01)
 
 
 def training_of(detector: Detector, stage: str) -> Training:
-    """The network of a detector's stage, with what its metadata tell of its training."""
+    """The network of a detector's stage, as a training with the provenance from the detector's metadata."""
     if stage not in detector.networks:
         raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.networks)}.")
     return Training(detector.networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
@@ -162,10 +162,10 @@ def assemble(
 ) -> Detector:  # fmt: skip
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The error models are fitted on half of the held-out scenes, whose families are new, on drawn grounds without a tool, and
-    on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
-    is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
-    lines for the card.  A stage that `folder` lacks is `initial`'s; without one, and without shards, a `FileNotFoundError`.
+    The error models are fitted on half of the held-out scenes, whose families no training saw, on drawn grounds without a
+    tool, and on labelled `recordings`, if any.  Those of the closeups are also fitted on half as many images of the reference
+    rig, since their bias must suit familiar tools, too.  The card's numbers come from the other half of the scenes.  `notes`
+    are lines for the card.  A missing stage is taken from `initial`.  Raises FileNotFoundError without it or without shards.
     """
     out = Path(out)
     trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
@@ -212,5 +212,5 @@ def card(detector: Detector, path: Path) -> str:
             trainings.append((stage, one))
             one = one.get("before")
     here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
-    told = {"p": detector.metadata, "trainings": trainings[::-1], "name": path.name, "megabytes": path.stat().st_size / 1e6}
-    return here.get_template("card.md").render(told)
+    names = {"p": detector.metadata, "trainings": trainings[::-1], "name": path.name, "megabytes": path.stat().st_size / 1e6}
+    return here.get_template("card.md").render(names)

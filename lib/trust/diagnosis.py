@@ -81,7 +81,7 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
         far = [k for k in np.argsort(-sizes) if sizes[k] > 2e3 * free.offset_sd[k]]
         each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in free.offsets[k])})" for k in far]
         text = f"Landmarks have constant offsets from the robot's report, in the tool's axes: {'; '.join(each)}."
-        cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
+        cure = "Robot or detector errs; labels set by hand show which. `calibrate` removes such offsets (--force if refused)."
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
         certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # the fit absorbs offsets, so residuals show none
         yield replace(found, gain=max(found.gain, float(certainty)), explained=float(1.0 - _LEAST_OFFSET_UM / size))

@@ -354,8 +354,9 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     outliers = np.argwhere(seen & ~c.view_inliers)
     size_px = np.linalg.norm(c.residuals_px.reshape(*seen.shape, 2)[tuple(outliers.T)], axis=1)
     if c.rig is not None:
-        depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, True))
-        stereo = {"optics": optics(c), "depth_um": [1e3 * np.median(depth) for depth in depths], "degrees": np.rad2deg}
+        own = True if c.covariance_px2 is None else (c.covariance_px2 + 0 * c.y_px[:, :, None])[c.inliers]  # NaN: not seen
+        depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, own))
+        stereo = {"optics": optics(c), "depth_um": [1e3 * np.nanmedian(depth) for depth in depths], "degrees": np.rad2deg}
     return TEMPLATES.get_template("report.txt").render(
         stereo, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
         worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]],

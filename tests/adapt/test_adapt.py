@@ -666,7 +666,8 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
-    assert "Learning curve" in page and "| within 5 %, % |" in (out / "weights.md").read_text(encoding="utf-8")
+    card = (out / "weights.md").read_text(encoding="utf-8")
+    assert "Learning curve" in page and "| within 5 %, % |" in card and "standard deviations of" in card
     said = capsys.readouterr().out
     assert f"set offset_s = {content['offset_s']:.4f} in " in said and "--weights" in said.splitlines()[-1]
     monkeypatch.setattr(Detector, "load", lambda *_, **__: lambda images: Landmarks.none(len(images)))

@@ -13,7 +13,8 @@ from lib.calibration import (
     paper_variances,
 )
 from lib.calibration.affine import estimate_noise
-from lib.calibration.checks import check_spread, extents
+from lib.calibration.checks import check_spread, extents, eyes_exchanged
+from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.camera_models import compare_models
@@ -481,6 +482,19 @@ def test_checks_can_be_waived():
     x, u = good()
     swapped = calibrate(x, u[::-1], checks=False)
     np.testing.assert_allclose(swapped.rig.left.matrix, calibrate(x, u).rig.right.matrix, rtol=1e-6)
+
+
+def test_swapped_eyes_of_a_head_whose_images_are_both_turned_are_refused():
+    for roll_rad, swapped in ((0.4, True), (0.7, False)):
+        rig = reference_rig(image_rotation_rad=(roll_rad, roll_rad))
+        assert eyes_exchanged(StereoRig(rig.right, rig.left).linear, 0.001) == swapped
+        assert not eyes_exchanged(rig.linear, 0.001)
+
+
+def test_a_mirrored_axis_that_looks_like_swapped_eyes_is_named_beside_them():
+    x, u = good()
+    with pytest.raises(ValueError, match="swapped.*one axis of x_mm"):
+        calibrate(x * [1, -1, 1], u)
 
 
 def test_a_head_whose_geometry_leaves_doubt_is_not_called_swapped():

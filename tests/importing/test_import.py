@@ -434,3 +434,14 @@ def test_a_tip_that_rests_in_one_point_gives_its_place(tmp_path, shipped):
     mapping.write_text(mapping.read_text().replace("[0, 1.99]", "[0, 0.01]"))
     with pytest.raises(ValueError, match="poses"):
         import_recording(folder, mapping, tmp_path / "short")
+
+
+def test_a_wrong_rate_of_frames_is_named_where_the_clock_is_beyond_its_search(monkeypatch):
+    def beyond(*data, **options):
+        raise ValueError("offset_s: the search ends at its upper edge.")
+
+    monkeypatch.setattr(importer, "estimate_time_offset", beyond)
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    fast = replace(recording, frames=Frames(None, None, np.arange(len(recording)) / recording.fps))
+    with pytest.raises(ValueError, match=r"at 25 fps last 1\.\d s, but the robot's log \d+\.\d s\..*frames\.csv"):
+        importer._clock(fast, search_s=0.5)

@@ -269,7 +269,7 @@ SPOILT = {
         r"the position of base, tip_1, tip_2 in the tool frame is not given; give tool\.landmarks_mm"),
     "a jaw along its hinge": (pose(tool=HINGE.replace("axis = [0, 0, 1]", "axis = [1, 0, 0]")),
         r"the jaw lies along the axis"),
-    "jaws that never open": (shut, r"the jaws open by 0 rad only, which leaves the hinge open"),
+    "jaws that never open": (shut, r"the jaws open by only 0 rad, which does not determine the hinge"),
 }  # fmt: skip
 
 

@@ -133,7 +133,7 @@ def test_networks_of_a_stage_that_is_none_are_named_and_settings_that_are_gone_a
     networks = metadata["networks"] | {"window": metadata["networks"]["tool"]}
     tensors |= {f"window{key[4:]}": value.clone() for key, value in tensors.items() if key.startswith("tool.")}
     write_checkpoint(path, tensors, metadata | {"networks": networks})
-    with pytest.raises(ValueError, match=r"weights\.safetensors: it has networks of stages that are none \(window\); train"):
+    with pytest.raises(ValueError, match=r"weights\.safetensors: it has networks of unknown stages \(window\); train"):
         Detector.load(path)
 
 

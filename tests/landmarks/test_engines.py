@@ -43,7 +43,7 @@ def test_a_shape_that_is_met_often_is_compiled_for_and_says_the_same(monkeypatch
     network, asked, request = StackedHourglass(HourglassConfig(4, 1, 1)).eval(), [], engines._request
     torch.nn.init.normal_(network.heads[0].weight)
     fast, images, side = OpenVinoNetwork(network, precision="f32"), torch.rand(2, 3, 33, 47), network.config.multiple
-    monkeypatch.setattr(engines, "_OFTEN", 2)
+    monkeypatch.setattr(engines, "_FREQUENT", 2)
     monkeypatch.setattr(engines, "_request", lambda of, shape: asked.append(shape) or request(of, shape))
     said = [fast(images)[-1] for _ in range(4)]
     assert asked[:2] == 2 * [engines._ANY_SHAPE] and asked[2:] == 2 * [(2, 3, *(-(-n // side) * side for n in (33, 47)))]
@@ -130,7 +130,7 @@ def test_a_gpu_finds_what_a_cpu_finds(gpu):
 def test_unknown_and_missing_engines_are_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     network = StackedHourglass(HourglassConfig(8, 1, 2))
-    with pytest.raises(ValueError, match="'abacus' is none"):
+    with pytest.raises(ValueError, match="'abacus' is unknown"):
         Detector(network, engine="abacus")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert default_engine() == "torch"

@@ -256,7 +256,7 @@ def test_gross_outliers_lose_their_weight():
         (lambda x, ul, ur: (x * np.nan, ul, ur), "0 points"),
         (lambda x, ul, ur: (x, ul * np.nan, ur * np.nan), "0 points"),
         (lambda x, ul, ur: (np.linspace(0, 1, 30)[:, None] * [1, 2, 3] + CENTRE_MM, ul, ur), "on one line"),
-        (lambda x, ul, ur: (x, ul, ur * np.nan), "leave the motion open"),
+        (lambda x, ul, ur: (x, ul, ur * np.nan), "do not determine the motion"),
     ],
 )
 def test_bad_images(change, text):

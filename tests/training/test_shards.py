@@ -84,7 +84,7 @@ def test_proposals_are_found_once_and_missing_ones_are_nan(monkeypatch, tmp_path
     found = shards.read_proposals(tmp_path)
     assert found.shape == (6, shards.PROPOSALS, 3, 2) and np.isnan(found[:3]).all()
     np.savez(tmp_path / "proposals_0000.npz", u=found[:2])
-    with pytest.raises(ValueError, match=r"proposals_0000.npz: is of other scenes"):
+    with pytest.raises(ValueError, match=r"proposals_0000.npz: made for other scenes"):
         shards.read_proposals(tmp_path)
     assert (found[3:, 0] == 2).all() and (found[3:, 1] == 1).all() and np.isnan(found[3:, 2:]).all()
 

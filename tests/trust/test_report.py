@@ -1,5 +1,8 @@
 """The calibration in words, the verdict on top."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 
 from lib.calibration import calibrate
@@ -20,3 +23,13 @@ def test_outliers_are_listed():
     u_left[[3, 50]] += 400
     text = report(calibrate(c.x_mm, [u_left, c.u_right]))
     assert "2 outliers (1 %)" in text and "    50:" in text and "left" in text
+
+
+def test_the_depth_of_one_detected_point_is_that_of_most():
+    """Points that the detector hardly knows say nothing of the others."""
+    c, told = simulate_correspondences(90, rng=np.random.default_rng(0)), []
+    for vague_px in (1.5, 30.0):
+        sd_px = np.where(np.arange(90) % 3 == 0, vague_px, 1.5)[:, None, None, None]
+        rows = replace(c, covariance_px2=sd_px**2 * np.broadcast_to(np.eye(2), (90, 2, 2, 2)))
+        told.append(float(re.search(r"depth +sd (\d+) um", report(calibrate(rows)))[1]))
+    assert told[1] < 1.5 * told[0]
