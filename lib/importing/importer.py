@@ -187,7 +187,7 @@ def _tool(
 def _did(
     spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
 ) -> list[str]:
-    """What the import did, in sentences, one a line of did.txt."""
+    """Render did.txt: the steps of the import, one sentence or more in each line."""
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)

@@ -23,7 +23,7 @@ from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VE
 
 #: Packages whose version can change a number.
 _PACKAGES = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
-#: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
+#: End of the comment of a study's parameter: ``; grid: 75, 300, 1500``.
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
