@@ -1,4 +1,4 @@
-"""For a course: a cell's result against the library's, recorded tables, and conclusions that the run's numbers support."""
+"""Tools of the course: compare a cell's result with the library's, read recorded tables, check conclusions on the run."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _NUMBER = re.compile(r"\{([a-z][a-z0-9_.]*?)(:[^{}]*)?\}")
 
 
 def agree(what: str, here: ArrayLike, library: ArrayLike, *, within: float, unit: str = "") -> None:
-    """Print by how much a cell's own result differs from the library's; AssertionError if by more than `within`."""
+    """Print the largest difference between a cell's own result and the library's; AssertionError if it exceeds `within`."""
     gap = float(np.max(np.abs(np.asarray(here, dtype=float) - np.asarray(library, dtype=float))))
-    line = f"{what}: this cell and lib differ by {gap:.1e} {unit}".rstrip() + f"; up to {within:g} is rounding."
+    line = f"{what}: this cell and lib differ by {gap:.1e} {unit}".rstrip() + f"; up to {within:g} counts as rounding."
     assert gap <= within, line  # a NaN fails too
     print(line)
 
 
 def in_range(**given: tuple[float, float, float]) -> None:
-    """Refuse a parameter out of range before anything is computed: name=(value, least, most), both of them allowed.
+    """Check parameters before anything is computed: name=(value, least, most).  Raises ValueError outside of [least, most].
 
     >>> in_range(share=(1.5, 0, 1))
     Traceback (most recent call last):
@@ -56,7 +56,7 @@ def filled(text: str, values: Mapping[str, float]) -> str:
 
 
 def holds(condition: str, values: Mapping[str, float]) -> bool:
-    """Whether a condition on metrics is true.
+    """True if a condition on metrics holds.
 
     >>> holds("2 * {a_um} < {b_um}", {"a_um": 1.0, "b_um": 3.0})
     True
@@ -65,32 +65,32 @@ def holds(condition: str, values: Mapping[str, float]) -> bool:
 
 
 def learnt(claims: Mapping[str, str]) -> Markdown:
-    """Conclusions, each with the condition on this run's metrics that supports it; one that fails says so.
+    """Conclusions with this run's numbers, as a list.  One whose condition fails is marked.
 
     Args:
-        claims: Text -> condition; both name metrics as ``{name}``, which `report.record` stated before.  A conclusion
-            whose metrics were not measured (no truth, no real data) is left out and counted.
+        claims: Text -> condition.  Both name metrics as ``{name}``, which `report.record` has recorded before.  If a metric
+            was not measured (no truth, no real data), the conclusion is left out and counted.
     """
     known = {name: value for name, value in report.RECORDED.items() if value is not None}
-    told = {text: condition for text, condition in claims.items() if {*metrics_named(text + condition)} <= set(known)}
+    measured = {text: condition for text, condition in claims.items() if {*metrics_named(text + condition)} <= set(known)}
     lines = []
-    for text, condition in told.items():
+    for text, condition in measured.items():
         doubt = "" if holds(condition, known) else "**Not all of this holds in this run:** "
         lines.append(f"- {doubt}{filled(text, known)}")
-    if missing := len(claims) - len(told):
-        more = " more" if told else ""
+    if missing := len(claims) - len(measured):
+        more = " more" if measured else ""
         rest = f"One{more} conclusion is" if missing == 1 else f"{missing}{more} conclusions are"
-        wanted = {name for text, condition in claims.items() for name in metrics_named(text + condition)}
-        void = [name for name in sorted(wanted) if report.RECORDED.get(name, 0.0) is None]
+        named = {name for text, condition in claims.items() for name in metrics_named(text + condition)}
+        empty = [name for name in sorted(named) if report.RECORDED.get(name, 0.0) is None]
         why = "The recording may have no truth or no labels, or a real data set, Open3D or a recorded table may be missing."
-        if void:
-            why = f"Without a value in this run: {', '.join(void)}. What they measure did not happen, or had no data."
+        if empty:
+            why = f"Without a value in this run: {', '.join(empty)}. What they measure did not happen, or there were no data."
         lines.append(f"- {rest} left out: this run could not measure all the numbers. {why}")
     return Markdown("\n".join(lines))
 
 
 class _Absent:
-    """Stands for a table that was never recorded: whatever is asked of it is missing."""
+    """Replaces a table that was never recorded: every access raises LookupError."""
 
     def __getattr__(self, name: str) -> object:
         raise LookupError("all of it")
@@ -98,7 +98,7 @@ class _Absent:
 
 @contextmanager
 def recorded_table(name: str, folder: Path = paths.RESULTS) -> Iterator[results.Table]:
-    """The recorded table `name` for a block of a notebook, which ends with one line where the table lacks what it needs.
+    """Give a block of a notebook the recorded table `name`.  If the table lacks something, print a line and end the block.
 
     >>> with recorded_table("never_swept") as table:
     ...     print(table.columns["error_um"].mean())

@@ -21,7 +21,7 @@ from notebooks.studies.realism import Profiles
 
 
 def gallery(images: Mapping[str, np.ndarray], *, columns: int = 4, width_in: float = 12.0) -> Figure:
-    """Titled images of one size in rows."""
+    """Images of one size in rows, with their titles."""
     rows = -(-len(images) // columns)
     height, width = next(iter(images.values())).shape[:2]
     page, axes = figure(
@@ -36,7 +36,7 @@ def gallery(images: Mapping[str, np.ndarray], *, columns: int = 4, width_in: flo
 
 
 def contact_sheet(recording: Recording, indices: Sequence[int], *, columns: int = 4, shrink: int = 4) -> Figure:
-    """Left images of a recording, with the annotated landmarks where there are any."""
+    """Left images of a recording and their times, with the annotated landmarks if there are any."""
     rows = -(-len(indices) // columns)
     width, height = recording.image_size_px
     page, axes = figure(
@@ -94,7 +94,7 @@ def rig_page(scene: Scene, microscope: Microscope, rig: StereoRig) -> Figure:
 
 
 def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure:
-    """Depth and opening over time for each motion, and the spectrum of a surgeon's tremor."""
+    """Depth of the landmarks and opening of the jaws over time, and spectrum of the base's velocity; a row per motion."""
     page, axes = figure(len(motions), 3, width_in=12, height_in=2.7 * len(motions), squeeze=False)
     for row, (name, motion) in zip(axes, motions.items(), strict=True):
         time = np.linspace(0, motion.duration_s, samples)
@@ -118,9 +118,10 @@ def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure
 
 
 def volume_page(recording: Recording) -> Figure:
-    """Where the landmarks were, from the labels of the left image (else the robot's x and y) and in depth; the opening jaws.
+    """Positions of the landmarks across the view and in depth, and distance between the tips over time.
 
-    Depth is along the true view where it is known, else along the robot's z.
+    Positions are the labels in the left image, or the robot's x and y if there are no labels.  Depth is along the left
+    camera's true viewing direction if that is known, else along the robot's z.
     """
     page, axes = figure(1, 3, width_in=12, height_in=3.6)
     x, labels, truth = recording.landmarks_mm(), recording.annotations, recording.truth
@@ -134,10 +135,10 @@ def volume_page(recording: Recording) -> Figure:
         width, height = recording.image_size_px
         axes[0].set(xlim=(0, width), ylim=(height, 0), title="Labels, left image (px)")
     else:
-        axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title="The robot's report at the frames")
+        axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title="Positions reported by the robot")
     axes[0].set_aspect("equal")
     axes[0].legend(fontsize=8)
-    axes[1].set(xlabel=f"{'depth' if truth else 'z of the robot'} about its mean (mm)", title="Depths covered")
+    axes[1].set(xlabel=f"{'depth' if truth else 'robot z'} minus its mean (mm)", title="Depths of the landmarks")
     axes[1].set_yticks(range(3), LANDMARK_COLOURS)
     axes[1].set_ylim(2.6, -0.6)
     axes[2].plot(recording.frames.time_s, np.linalg.norm(x[:, 1] - x[:, 2], axis=1), "o-", color=COLOURS["ours"])
@@ -146,9 +147,9 @@ def volume_page(recording: Recording) -> Figure:
 
 
 def annotation_errors(recording: Recording) -> np.ndarray:
-    """Clicked minus true landmarks (n, 2) px of both cameras; needs a simulated recording."""
+    """Errors (n, 2) px of the clicked landmarks in both images.  Raises ValueError without truth or labels."""
     if recording.truth is None or recording.annotations is None:
-        raise ValueError(f"recording: {recording.name} has no truth or no annotations; take a simulated one.")
+        raise ValueError(f"recording: {recording.name} has no truth or no annotations; give a simulated recording.")
     errors = [
         (getattr(recording.annotations, f"u_{side}") - getattr(recording.truth, f"u_{side}")).reshape(-1, 2)
         for side in ("left", "right")
@@ -158,7 +159,7 @@ def annotation_errors(recording: Recording) -> np.ndarray:
 
 
 def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndarray]) -> Figure:
-    """Distribution of each statistic: simulated windows against the 5th to 95th percentile of the real frames.
+    """Distribution of each statistic in real frames and simulated windows; the band: 5th to 95th real percentile.
 
     Both arguments map a statistic to its values (n,).
     """
@@ -181,7 +182,7 @@ def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndar
 
 
 def verdict_page(judgements: Mapping[str, Sequence[Mapping]]) -> Figure:
-    """Where the median of the simulated windows lies in the range of the real frames, statistic by statistic.
+    """Position of the simulated median in the range of the real frames, for each statistic.
 
     Parameters
     ----------
@@ -196,7 +197,7 @@ def verdict_page(judgements: Mapping[str, Sequence[Mapping]]) -> Figure:
         ax.plot(place.clip(-0.6, 1.6), y, marker, color=colour, label=name, markersize=6)
     ax.axvspan(0, 1, color="#eeeeee", zorder=0)
     ax.set_yticks(range(len(rows)), [r["name"].replace("_", " ") for r in rows])
-    ax.set(xlim=(-0.65, 1.65), xlabel="0: the real 5th percentile, 1: the 95th (beyond the axis: drawn at its end)")
+    ax.set(xlim=(-0.65, 1.65), xlabel="0: 5th percentile of real frames, 1: 95th (values beyond the axis: at its end)")
     ax.set_title("Median of the simulated windows")
     ax.invert_yaxis()
     ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -204,16 +205,16 @@ def verdict_page(judgements: Mapping[str, Sequence[Mapping]]) -> Figure:
 
 
 def stages_page(seconds: Mapping[str, float]) -> Figure:
-    """CPU seconds of a stereo pair by stage of its making, as bars."""
+    """CPU seconds that each stage of the simulator takes for a stereo pair, as bars."""
     page, ax = figure(width_in=8, height_in=0.35 * len(seconds) + 0.9)
     ax.barh(list(seconds), list(seconds.values()), color=COLOURS["baseline"])
     ax.invert_yaxis()
-    ax.set(xlabel="CPU seconds a pair")
+    ax.set(xlabel="CPU seconds per stereo pair")
     return page
 
 
 def profiles_page(pairs: Mapping[str, tuple[Profiles, Profiles]]) -> Figure:
-    """Distributions of real and simulated images, a row for each pair (real, simulated).
+    """Luminance, colour, gradients and power spectrum of real and simulated images, a row for each pair (real, simulated).
 
     Lines are means over images; the grey band holds the middle 90 % of the real images.
     """
@@ -247,7 +248,7 @@ def profiles_page(pairs: Mapping[str, tuple[Profiles, Profiles]]) -> Figure:
 def realism_sheet(
     pairs: Mapping[str, tuple[Sequence[np.ndarray], Sequence[np.ndarray]]], *, columns: int = 8
 ) -> Figure:
-    """Rows of real windows, each with a row of simulated ones below."""
+    """Rows of real windows, each above a row of simulated windows."""
     page, axes = figure(2 * len(pairs), columns, width_in=12, height_in=3.1 * len(pairs), squeeze=False)
     rows = [
         (f"{kind}, {name}", images)
@@ -262,10 +263,13 @@ def realism_sheet(
 
 
 def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]]:
-    """For each landmark, in how many images of both cameras it is visible, hidden by the tool, outside, and in glint."""
+    """Landmark -> number of images of both cameras in which it is visible, hidden by the tool, outside, and near a glint.
+
+    Raises ValueError for a recording without truth.
+    """
     truths = [recording.truth for recording in recordings]
     if None in truths:
-        raise ValueError("recordings: one has no truth; take simulated ones.")
+        raise ValueError("recordings: one has no truth; give simulated recordings.")
     visibility = np.concatenate([np.stack([t.visibility_left, t.visibility_right]) for t in truths], axis=1)
     counts = {
         name: {
@@ -283,10 +287,10 @@ def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]
 
 
 def ray_cast_depth(scene: Scene, window: Window, u: np.ndarray, *, step_mm: float = 0.01) -> np.ndarray | None:
-    """Depth z (n,) mm of a scene at pixels u (n, 2) by Open3D's ray caster; None where Open3D cannot be imported.
+    """Depth z (n,) mm of a scene at pixels u (n, 2) by Open3D's ray caster; None if Open3D cannot be imported.
 
-    The surface becomes a mesh of triangles of `step_mm`.  Rays start far above it, so nothing is shared with our renderer
-    but the height field and the camera.
+    The surface becomes a mesh with triangles of `step_mm`.  Rays start far above it.  Only the height field and the camera
+    are shared with our renderer.
     """
     try:
         o3d = open3d()

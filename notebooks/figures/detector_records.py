@@ -22,21 +22,21 @@ PAPER_ABLATION = {"encoder": 8.4, "+ decoder": 75.1, "+ skips": 95.2, "+ stack":
 
 
 def recorded(table: Table) -> str:
-    """ "Recorded", when, and how often so far: the beginning of a caption."""
+    """The beginning of a caption: "Recorded", the date, and how often the table was recorded so far."""
     times = table.provenance.get("times_recorded", 1)
     often = f" (the last of {times} times)" if times > 1 else ""
     return f"Recorded {table.provenance.get('date', 'at an unknown date')}{often}"
 
 
 def weights(table: Table) -> str:
-    """Whether a table was recorded with the weights that ship now, and by the code of which commit."""
+    """Part of a caption: the weights (those that ship now, or others) and the commit with which a table was recorded."""
     same = table.provenance.get("weights") == digest(paths.MODELS / "default.safetensors")
     commit = table.provenance.get("commit", {}).get("id", "an unknown commit")[:7]
     return f"with {'the weights that ship' if same else 'other weights than those that ship now'}, by the code of {commit}"
 
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over seeds and its standard error, NaN for one seed.
+    """Mean over the seeds, and its standard error; NaN for one seed.
 
     >>> mean_and_error([1.0, 3.0])
     (2.0, 1.0)
@@ -46,12 +46,14 @@ def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
 
 
 def groups(table: Table, column: str) -> dict[object, Table]:
-    """The rows of each value of a column, in their order."""
+    """Value of a column -> the rows with this value, in their order."""
     return {value: table.where(**{column: value}) for value in dict.fromkeys(row[column] for row in table.rows)}
 
 
 def verdicts(table: Table, column: str, metric: str) -> dict[str, str]:
-    """Each value of a column against the one before: "better", "worse", or "tie" below two standard errors."""
+    """Compare each value of a column with the one before: "better", "worse", or "tie" if they differ by less than two
+    standard errors.  A single seed gives no statement.
+    """
     means = {name: mean_and_error(rows.columns[metric]) for name, rows in groups(table, column).items()}
     result = {}
     for (before, (a, error_a)), (name, (b, error_b)) in pairwise(means.items()):
@@ -62,14 +64,14 @@ def verdicts(table: Table, column: str, metric: str) -> dict[str, str]:
 
 
 def curve(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Thresholds and PCK in percent, the mean over the rows."""
+    """Thresholds, and PCK in percent as a mean over the rows."""
     found = {float(m[1]): m[0] for m in (re.fullmatch(r"pck_([\d.]+)_percent", name) for name in table.columns) if m}
     thresholds = np.array(sorted(found))
     return thresholds, np.array([np.mean(table.columns[found[t]]) for t in thresholds])
 
 
 def ablation_bars(table: Table) -> Figure:
-    """PCK@0.05 of the five networks: a dot a seed, a bar for the mean, and the paper's value."""
+    """PCK@0.05 of the five networks: a dot for each seed, a bar for the mean, and the paper's value."""
     fig, ax = figure(width_in=8, height_in=3.2)
     for i, (name, rows) in enumerate(groups(table, "network").items()):
         values = rows.columns["pck_0.05_percent"]
@@ -111,7 +113,7 @@ def papers_network_curves(table: Table, shipped: Table) -> Figure:
 
 
 def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
-    """How long the paper's network was trained, how good it became, and the calibration from it; header and rows."""
+    """Header and rows: training time of the paper's network, its accuracy, and the error of a calibration from it."""
     columns = {
         "epochs": ("epochs_done", ".1f"),
         "steps": ("steps", ".0f"),
@@ -127,15 +129,15 @@ def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
 
 
 def few_labels_curves(table: Table) -> Figure:
-    """PCK@0.2 on real frames against the number of labelled ones: the same sequence, and the other one."""
+    """PCK@0.2 on real frames against the number of labelled frames: in the same sequence, and in the other one."""
     fig, axes = figure(1, 2, width_in=10, height_in=3.6, sharey=True)
     counts = sorted({row["frames"] for row in table.rows})
     for (name, rows), colour in zip(groups(table, "sequence").items(), ("ours", "paper"), strict=False):
         x, own = [counts.index(row["frames"]) for row in rows.rows], rows.columns["pck_0.20_percent"]
         axes[0].plot(x, own, "o-", color=COLOURS[colour], label=f"{name}, second half")
-        axes[0].axhline(rows.rows[0]["clicks_pck_0.20_percent"], color=COLOURS[colour], ls=":", label="clicks allow")
+        axes[0].axhline(rows.rows[0]["clicks_pck_0.20_percent"], color=COLOURS[colour], ls=":", label="limit of the clicks")
         axes[1].plot(x, rows.columns["elsewhere_pck_0.20_percent"], "o-", color=COLOURS[colour], label=f"labels of {name}")
-    for ax, title in zip(axes, ("the same sequence", "the other sequence"), strict=True):
+    for ax, title in zip(axes, ("The same sequence", "The other sequence"), strict=True):
         ticks = ["all" if count > max(row["labelled"] for row in table.rows) else f"{count:g}" for count in counts]
         ax.set_xticks(range(len(counts)), ticks)
         ax.set(ylim=(0, 101), xlabel="labelled frames", title=title)
@@ -150,7 +152,7 @@ def most_labels(table: Table) -> list[dict]:
 
 
 def label_noise_cost(table: Table) -> tuple[float, float]:
-    """Mean and standard error over the seeds of what noisy labels add to the median error, px."""
+    """Increase of the median error (px) by noisy labels: mean over the seeds, and its standard error."""
     exact, noisy = (
         {row["seed"]: row["median_px"] for row in table.rows if bool(row["noise_px"]) == is_noisy}
         for is_noisy in (False, True)
@@ -159,7 +161,7 @@ def label_noise_cost(table: Table) -> tuple[float, float]:
 
 
 def label_noise_pairs(table: Table) -> Figure:
-    """Median error of networks trained with exact and with noisy labels; a line joins those of one seed."""
+    """Median error of networks trained with exact and with noisy labels; a line joins the two of one seed."""
     fig, ax = figure(width_in=5.5, height_in=3.4)
     medians = np.array([rows.columns["median_px"] for rows in groups(table, "noise_px").values()])
     ax.plot([0, 1], medians, "o-", color=COLOURS["ours"], ms=7)
@@ -172,7 +174,7 @@ def label_noise_pairs(table: Table) -> Figure:
 
 
 def shipped_curve(table: Table) -> Figure:
-    """PCK of the shipped detector on the test sequences, whole frames and tracking; right, the top enlarged."""
+    """PCK of the shipped detector on the test sequences, for whole frames and tracking; right, the upper end enlarged."""
     fig, axes = figure(1, 2, width_in=11, height_in=3.8)
     everything = table.where(recording="all")
     thresholds, pck = curve(everything.where(mode="whole frames"))
@@ -189,13 +191,13 @@ def shipped_curve(table: Table) -> Figure:
         ax.minorticks_off()
         ax.set(xlabel="threshold, fraction of the tool's length", ylabel="PCK, %")
     axes[0].set_title("Correct landmarks")
-    axes[1].set_title("The top of it, enlarged")
+    axes[1].set_title("Upper end, enlarged")
     axes[0].legend(loc="lower right")
     return fig
 
 
 def shipped_rows(table: Table) -> tuple[list[str], list[list[str]]]:
-    """Scores of the shipped detector, header and rows: all whole frames, tracking, by landmark, by sequence."""
+    """Header and rows: scores of the shipped detector on whole frames and while tracking, by landmark, and by sequence."""
     everything = {row["mode"]: row for row in table.where(recording="all").rows}
     rows = {f"all, {mode}": row for mode, row in everything.items()}
     whole = everything["whole frames"]
@@ -262,7 +264,7 @@ def engine_bars(table: Table) -> Figure:
 
 
 def speed_rows(table: Table, threads: int = 2) -> dict[str, dict[str, float]]:
-    """Milliseconds of a stereo pair by engine and precision: the full-HD networks that were timed in it."""
+    """Engine and precision -> network -> milliseconds per stereo pair in full HD."""
     full_hd = "1920x1080"  # also where the sweep left the size at its default
     pairs = [row for row in table.rows if (row["images"], row["threads"]) == (2, threads)]
     pairs = [row for row in pairs if row["network"] != "window stage" and row.get("size", full_hd) == full_hd]

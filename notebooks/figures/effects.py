@@ -1,4 +1,4 @@
-"""Pictures of imaging effects: the same window of the same moment, with one effect at a time."""
+"""Images of imaging effects: the same view with one effect at a time."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def render_window(
     velocity_mm_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
     seed: int = 0,
 ) -> View:
-    """A window of the full-resolution image around the jaws: fast enough for a slider.
+    """Render a window of the full-resolution image around the jaws, which is fast enough for a slider.
 
-    `velocity_mm_s` is the tool's, for motion blur and rolling shutter.
+    `velocity_mm_s` is the velocity of the tool, which causes motion blur and the effect of the rolling shutter.
     """
     rig = microscope.rig(RigidTransform.identity())
     centre = rig.left.project(forceps.landmarks(pose)).mean(axis=0)
@@ -58,7 +58,7 @@ def render_window(
 
 
 def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarray]:
-    """Title -> image (h, w, 3): no effect, each effect alone (stronger than by default, to be seen), and all together."""
+    """Title -> image (h, w, 3): no effect, each effect alone (most stronger than by default, to make it visible), and all."""
     matt = replace(eye, gloss=0.0)
     fast = (9.0, 14.0, 0.0)
     default = Microscope()

@@ -1,4 +1,4 @@
-"""Figures of notebook 02 that its own run draws: network, heatmaps, augmentation, training, detections."""
+"""Figures of notebook 02 with results of its own run: network, heatmaps, augmentation, training, detections."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure,
 
 
 def landmark_dots(axes: Axes, u: np.ndarray, *, size: float = 60.0, label: bool = False) -> None:
-    """Landmarks (3, 2) as open circles in their colours; NaN is left out."""
+    """Draw landmarks (3, 2) px as open circles in their colours; NaN is left out."""
     for (name, colour), point in zip(LANDMARK_COLOURS.items(), u, strict=True):
         axes.scatter(
             *point, s=size, facecolors="none", edgecolors=colour, linewidths=1.8, label=name if label else None
@@ -31,7 +31,7 @@ def landmark_dots(axes: Axes, u: np.ndarray, *, size: float = 60.0, label: bool 
 
 
 def network_page(config: HourglassConfig, parameters: int) -> Figure:
-    """The stacked hourglass drawn to its depth: boxes are blocks, their height the resolution, arcs the skips."""
+    """The stacked hourglass: boxes are blocks, their heights show the resolution, arcs are skip connections."""
     fig, ax = figure(width_in=10, height_in=3.4)
     ax.set_axis_off()
     ax.grid(False)
@@ -70,20 +70,20 @@ def network_page(config: HourglassConfig, parameters: int) -> Figure:
 
 
 def _pale(image: np.ndarray) -> np.ndarray:
-    """Light grey values of an image (h, w, 3), uint8 or in [0, 1], as a ground for what is laid over it."""
+    """Light grey values of an image (h, w, 3), uint8 or in [0, 1], as a background for a heatmap."""
     grey = image.mean(axis=2)
     low, high = np.percentile(grey, (1, 99))
     return np.repeat(0.45 + 0.5 * np.clip((grey - low) / max(high - low, 1e-9), 0, 1)[..., None], 3, axis=2)
 
 
 def _lay_over(ax: Axes, heatmap: np.ndarray, extent: tuple[float, float, float, float]) -> None:
-    """A heatmap in [0, 1] over an image: clear where it is 0."""
+    """Draw a heatmap in [0, 1] over an image; it is transparent where it is 0."""
     shown = np.clip(heatmap, 0, 1)
     ax.imshow(shown, cmap="magma_r", alpha=np.minimum(1.6 * shown, 0.9), extent=extent, vmin=0, vmax=1)
 
 
 def heatmap_grid(image: np.ndarray, heatmaps: np.ndarray, u: np.ndarray, stride: int) -> Figure:
-    """One image with its three heatmaps (3, h, w), each in units of its peak, over it; `u` (3, 2) in image pixels."""
+    """An image with landmarks `u` (3, 2) px, then with each of its heatmaps (3, h, w), divided by the peak, over it."""
     fig, axes = figure(1, 4, width_in=10.5, height_in=2.9)
     show_image(axes[0], image, "image and landmarks")
     landmark_dots(axes[0], u, size=90)
@@ -118,7 +118,7 @@ def printed_equation(truths: np.ndarray, printed: np.ndarray, normalised: np.nda
 
 
 def disc_page(p: np.ndarray, truth: np.ndarray, found: Mapping[str, np.ndarray], radius: float) -> Figure:
-    """A heatmap (h, w) with the disc of Eq. (1) and the positions read from it, and a section through the peak's row."""
+    """A heatmap (h, w) with the disc of Eq. (1) and the decoded positions, and a section through the peak's row."""
     fig, (a, b) = figure(1, 2, width_in=9.5, height_in=3.6, width_ratios=(1, 1.3))
     show_image(a, p, "heatmap")
     a.images[0].set_cmap("inferno")
@@ -131,13 +131,13 @@ def disc_page(p: np.ndarray, truth: np.ndarray, found: Mapping[str, np.ndarray],
     for (name, u), colour in zip(found.items(), ("paper", "ours"), strict=False):
         a.plot(*u, "o", color=COLOURS[colour], ms=6)
         b.axvline(u[0], color=COLOURS[colour], ls="--", label=f"{name}: {np.linalg.norm(u - truth):.2f} px off")
-    b.set(xlabel="x, px", title="the peak's row", xlim=(0, p.shape[1] - 1))
+    b.set(xlabel="x, px", title="Row of the peak", xlim=(0, p.shape[1] - 1))
     b.legend(fontsize=9)
     return fig
 
 
 def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks; a row for each title, which its first image has."""
+    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks; one row for each title, which stands over its first image."""
     rows, columns = len(titles), len(images) // len(titles)
     fig, axes = figure(rows, columns, width_in=10, height_in=1.8 * rows, squeeze=False)
     for ax in axes.flat:
@@ -151,7 +151,7 @@ def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Seq
 
 
 def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
-    """Loss and validation PCK against steps, one colour a training."""
+    """Loss, validation PCK and median error against the steps, one colour for each training."""
     fig, (a, b, c) = figure(1, 3, width_in=11, height_in=3.4)
     for (name, log), colour in zip(logs.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False):
         step = [row["step"] for row in log]
@@ -160,9 +160,9 @@ def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
         b.plot(step, [row["pck_0.10"] for row in log], color=colour, marker="o", ms=4, label="PCK@0.10")
         b.plot(step, [row["pck_0.05"] for row in log], color=colour, ls="--", marker="o", ms=4, label="PCK@0.05")
         c.plot(step, [row["median_px"] for row in log], color=colour, marker="o", ms=4, label=name)
-    a.set(title="loss (1 = empty heatmaps)", xlabel="step")
-    b.set(title="validation PCK", xlabel="step", ylabel="%", ylim=(0, 100))
-    c.set(title="median error", xlabel="step", ylabel="px", yscale="log")
+    a.set(title="Loss (1 = empty heatmaps)", xlabel="step")
+    b.set(title="Validation PCK", xlabel="step", ylabel="%", ylim=(0, 100))
+    c.set(title="Validation median error", xlabel="step", ylabel="px", yscale="log")
     a.set_ylim(bottom=0)
     c.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     c.yaxis.set_major_formatter("{x:g}")
@@ -175,7 +175,7 @@ def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
 def pck_curves(
     curves: Mapping[str, np.ndarray], *, thresholds: np.ndarray = PCK_THRESHOLDS, paper: bool = True
 ) -> Figure:
-    """PCK in percent against the threshold, logarithmic: the strict end is where detectors differ."""
+    """PCK in percent against the threshold.  The axis is logarithmic, since detectors differ at strict thresholds."""
     fig, ax = figure(width_in=8, height_in=3.8)
     for name, curve in curves.items():
         colour = LANDMARK_COLOURS.get(name, "black")
@@ -204,7 +204,7 @@ def _ellipse(axes: Axes, u: np.ndarray, covariance: np.ndarray, colour: str, pro
 
 
 def detection(image: np.ndarray, evaluation: Evaluation, index: int, *, half_px: int = 14) -> Figure:
-    """A frame with its detections, and each landmark close up: 95 % ellipse, detection (dot) and label (cross)."""
+    """A frame with its detections, and each landmark enlarged: 95 % ellipse, detection (dot) and label (cross)."""
     fig, axes = figure(1, 4, width_in=11, height_in=2.9, width_ratios=[1.8, 1, 1, 1])
     found, truth = evaluation.landmarks, evaluation.u_true[index]
     show_image(axes[0], image[::2, ::2], evaluation.names[index])
@@ -219,7 +219,7 @@ def detection(image: np.ndarray, evaluation: Evaluation, index: int, *, half_px:
         x, y = np.clip(np.round(centre), half_px, (w - 1 - half_px, h - 1 - half_px))
         ax.set(xlim=(x - half_px - 0.5, x + half_px + 0.5), ylim=(y + half_px + 0.5, y - half_px - 0.5))
         ax.images[0].set_interpolation("nearest")
-        for size, width, colour_of_label in ((200, 3.6, "black"), (160, 1.6, "white")):  # seen on metal, too
+        for size, width, colour_of_label in ((200, 3.6, "black"), (160, 1.6, "white")):  # visible on metal, too
             ax.scatter(*truth[k], marker="+", s=size, c=colour_of_label, linewidths=width)
         if np.isfinite(found.u[index, k]).all():
             ax.scatter(*found.u[index, k], s=18, c=colour)
@@ -246,14 +246,14 @@ def worst_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: 
 
 
 def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
-    """Do covariance and confidence mean what they say: distribution of the squared error, and reliability."""
+    """Are covariance and confidence right?  Distribution of normalised squared errors, and reliability."""
     fig, (a, b) = figure(1, 2, width_in=11, height_in=3.4)
     values = np.sort(squared[np.isfinite(squared)])
     grid = np.linspace(0, 12, 200)
     a.plot(grid, 100 * np.searchsorted(values, grid) / max(len(values), 1), color=COLOURS["ours"], label="detections")
     a.plot(grid, 100 * chdtr(2, grid), color=COLOURS["truth"], ls="--", label="if covariances are right")
     a.axvline(chdtri(2, 0.05), color=COLOURS["baseline"], lw=1, label="95 % ellipse")
-    a.set(title="Squared error over its covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
+    a.set(title="Squared error by covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
     a.legend()
     labelled = ~np.isnan(evaluation.error_px)
     mean, fraction, count = reliability(evaluation.landmarks.confidence[labelled], evaluation.correct[labelled])
@@ -264,14 +264,15 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     )
     for at, share, n in zip(mean[used], fraction[used], count[used], strict=True):
         b.annotate(f"{n:.0f}", (at, share), (0, -16), textcoords="offset points", ha="center", fontsize=9)
-    low = max(min(mean[used].min(initial=1), fraction[used].min(initial=1)) - 0.15, -0.02)  # a good detector fills a corner
+    # The dots of a good detector lie in the upper right corner, so the axes show no more than the dots need.
+    low = max(min(mean[used].min(initial=1), fraction[used].min(initial=1)) - 0.15, -0.02)
     b.set(title="Reliability", xlabel="confidence", ylabel="fraction correct", xlim=(low, 1.03), ylim=(low, 1.03))
     b.legend(loc="lower right")
     return fig
 
 
 def timing_bars(ms: Mapping[str, float], paper_hz: Mapping[str, float], *, title: str) -> Figure:
-    """Stereo pairs a second of each row (milliseconds a pair), and the paper's on its graphics card; logarithmic."""
+    """Stereo pairs per second, from milliseconds per pair, and the paper's on its graphics card; logarithmic."""
     pairs_per_s = {name: 1e3 / value for name, value in ms.items()}
     fig, ax = figure(width_in=9, height_in=0.5 * len(pairs_per_s) + 1.1)
     for i, (name, rate) in enumerate(pairs_per_s.items()):
@@ -283,7 +284,7 @@ def timing_bars(ms: Mapping[str, float], paper_hz: Mapping[str, float], *, title
     ax.plot([], [], "D", color=COLOURS["paper"], label="paper, Titan X")
     ax.set_yticks(range(len(pairs_per_s)), list(pairs_per_s))
     ax.invert_yaxis()
-    ax.set(xscale="log", xlabel="stereo pairs a second", title=title)
+    ax.set(xscale="log", xlabel="stereo pairs per second", title=title)
     ax.set_xlim(0.5 * min(pairs_per_s.values()), 2 * max(*pairs_per_s.values(), *paper_hz.values()))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.legend(loc="lower right", bbox_to_anchor=(1, 1))
@@ -291,13 +292,13 @@ def timing_bars(ms: Mapping[str, float], paper_hz: Mapping[str, float], *, title
 
 
 def loss_slopes(displacement_px: np.ndarray, losses: Mapping[str, Sequence[float]]) -> Figure:
-    """What a heatmap costs that is a perfect Gaussian at a wrong place: each loss against the displacement."""
+    """Each loss of a heatmap that is a perfect Gaussian, against the displacement of the Gaussian."""
     fig, ax = figure(width_in=7.5, height_in=3.6)
     for (name, values), colour in zip(
         losses.items(), (COLOURS["baseline"], COLOURS["paper"], COLOURS["ours"]), strict=False
     ):
         ax.plot(displacement_px, values, color=colour, lw=2.5, label=name)
-    ax.set(xlabel="the peak is displaced by, px", ylabel="loss", title="The last pixel", ylim=(0, None))
+    ax.set(xlabel="displacement of the peak, px", ylabel="loss", title="Loss against displacement", ylim=(0, None))
     ax.set_xlim(0, displacement_px[-1])
     ax.legend(loc="upper left")
     return fig
@@ -312,14 +313,14 @@ def focus_distance_mm(recording: Recording, *, every: int = 1) -> np.ndarray:
         If the recording is not simulated.
     """
     if recording.truth is None:
-        raise ValueError(f"{recording.name}: it has no truth/, so the distance from focus is unknown.")
+        raise ValueError(f"{recording.name}: has no truth/, so the distance from focus is unknown; give a simulated one.")
     x = recording.truth.landmarks_mm[: len(recording.frames) : every]
     z = ROBOT_FROM_MICROSCOPE.inverse().apply(x.reshape(-1, 3))[:, 2].reshape(-1, 3)
     return np.repeat(z, 2, axis=0)
 
 
 def error_groups(groups: Mapping[str, Mapping]) -> Figure:
-    """Median error (dot) and 95th percentile (tick) of groups of landmarks, one panel a grouping: name -> its `Scores`."""
+    """Median error (dot) and 95th percentile (tick) of groups of landmarks; `groups`: panel -> name -> `Scores`."""
     fig, axes = figure(
         1,
         len(groups),
@@ -343,9 +344,9 @@ def error_groups(groups: Mapping[str, Mapping]) -> Figure:
 def frame_explorer(
     image: np.ndarray, found: Landmarks, windows: np.ndarray, matrices: np.ndarray, heatmaps: np.ndarray
 ) -> Figure:
-    """One frame with its landmarks; each landmark's window with its heatmap laid over, and its 95 % ellipse.
+    """One frame with its landmarks; for each landmark the window with the heatmap over it, and the 95 % ellipse.
 
-    `windows` (m, s, s, 3), `matrices` window_from_image (m, 2, 3) and `heatmaps` (m, h, w) of the m landmarks found.
+    `windows` (m, s, s, 3), `matrices` (m, 2, 3), window_from_image, and `heatmaps` (m, h, w) belong to the m landmarks found.
     """
     fig, axes = figure(1, 4, width_in=11, height_in=2.7, width_ratios=[1.8, 1, 1, 1])
     show_image(axes[0], image[::2, ::2], "frame")
@@ -367,8 +368,11 @@ def frame_explorer(
 
 
 def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks, names: Sequence[str]) -> Figure:
-    """Closeups (n, s, s, 3): where the windows said the landmark lies (cross, `expected` (n, 2)), where the network sees
-    it with its 95 % ellipse (`seen`, (n, 1)), and the corrected position (dot, `kept`, (n, 1)); below, 12 px of each."""
+    """Closeups (n, s, s, 3), and 12 px of each below.
+
+    A cross is the position `expected` (n, 2) from the tool's window, an ellipse the closeup's 95 % ellipse (`seen`, peaks
+    (n, 1)), a dot the corrected position (`kept`, peaks (n, 1)).
+    """
     fig, axes = figure(2, len(windows), width_in=9, height_in=6.2, squeeze=False)
     for i, (whole, ax, name) in enumerate(zip(*axes, names, strict=True)):
         show_image(whole, windows[i], name)
@@ -377,7 +381,7 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
         x, y = expected[i]
         ax.set(xlim=(x - 6, x + 6), ylim=(y + 6, y - 6))
         deviation = np.sqrt(np.diag(seen.covariance[i, 0].numpy()))
-        ax.plot(*expected[i], "+", ms=18, mew=2, color="white", label="windows")
+        ax.plot(*expected[i], "+", ms=18, mew=2, color="white", label="tool's window")
         size = 2 * np.sqrt(chdtri(2, 0.05)) * deviation
         ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec="yellow", lw=2, label="closeup, 95 %"))
         ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="corrected")
@@ -386,7 +390,7 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
 
 
 def decoder_errors(errors_px: Mapping[str, np.ndarray]) -> Figure:
-    """Distribution of the error of several decoders on the same heatmaps."""
+    """Distribution of the errors of several decoders on the same heatmaps."""
     fig, ax = figure(width_in=8, height_in=3.4)
     looks = zip(("baseline", "paper", "right", "truth", "ours"), ("-", "-", "--", "-.", "-"), strict=True)
     for (colour, line), (name, error) in zip(looks, errors_px.items(), strict=False):
@@ -399,7 +403,7 @@ def decoder_errors(errors_px: Mapping[str, np.ndarray]) -> Figure:
         ylim=(0, 101),
         xlabel="error, px",
         ylabel="% below",
-        title="Decoders, trained heatmaps",
+        title="Decoders on trained heatmaps",
     )
     ax.xaxis.set_major_formatter("{x:g}")
     ax.legend(title="median", loc="upper left")

@@ -33,7 +33,7 @@ def frame_pair(left: np.ndarray, right: np.ndarray, u_left: np.ndarray, u_right:
 
 
 def pixel_grid(domain: tuple[float, float, float, float], columns: int = 96) -> np.ndarray:
-    """Pixels (rows, columns, 2) evenly over the domain (x0, y0, x1, y1), square cells."""
+    """A grid of pixels (rows, columns, 2) over the domain (x0, y0, x1, y1); its cells are about square."""
     x0, y0, x1, y1 = domain
     rows = max(round(columns * (y1 - y0) / (x1 - x0)), 2)
     return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
@@ -48,20 +48,20 @@ def pipeline_page(
     error_um: np.ndarray | None,
     registration_um: dict[str, tuple[np.ndarray, np.ndarray]],
 ) -> Figure:
-    """Six panels, one a stage.
+    """Six panels: landmarks, calibration residuals, matches, the retina, its error or height, and the registration error.
 
     Parameters
     ----------
     left, u_left:
         A left image and its landmarks (3, 2) px.
     result:
-        Of the online pipeline for this frame, with a reconstruction.
+        The online pipeline's result for this frame; it must have a reconstruction.
     residuals_px:
         Reprojection residuals (m, 4) of the calibration, left and right.
     surface_mm, error_um:
-        Points (h, w, 3) of the surface over a `pixel_grid`, robot frame, and its error (h, w); None without a truth.
+        Points (h, w, 3) mm of the surface over a `pixel_grid`, in the robot frame, and its error (h, w); None = no truth.
     registration_um:
-        For each method, frames used (k,) and translation error (k,) in um; empty without held-out frames.
+        Method -> numbers of frames (k,) and translation errors (k,) in um; empty without a calibration of half the frames.
     """
     page = plt.figure(figsize=(13, 7.4), layout="constrained", facecolor="white")
     grid = page.add_gridspec(2, 3)
@@ -92,7 +92,7 @@ def pipeline_page(
     ax.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="height (mm)")
     for axis in "yz":  # their ticks would overlap
         ax.locator_params(axis=axis, nbins=3)
-    ax.set_title("4  The retina, heights 2.5 times", **title)
+    ax.set_title("4  The retina, heights x 2.5", **title)
 
     ax = page.add_subplot(grid[1, 1])
     if error_um is None:
@@ -111,7 +111,7 @@ def pipeline_page(
         panel.set_anchor("NW")  # images and squares of one row begin at one height
     if not registration_um:
         ax.set_axis_off()
-        ax.text(0.0, 0.9, "Left out: half of the frames alone\ngive no calibration.", va="top", transform=ax.transAxes)
+        ax.text(0.0, 0.9, "Left out: half of the frames\ndo not give a calibration.", va="top", transform=ax.transAxes)
         return page
     for (method, (frames, error)), colour in zip(
         registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False
@@ -123,11 +123,11 @@ def pipeline_page(
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
     ax.grid(True, color="#e6e6e6", linewidth=0.6)
-    ax.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0, -0.16))  # below: curves go everywhere
+    ax.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0, -0.16))  # outside, clear of curves
     return page
 
 
 def _upright(surface_mm: np.ndarray, camera_from_robot: np.ndarray) -> np.ndarray:
-    """(3, h, w) mm: right and up in the image, and height towards the camera, about the middle of the surface."""
+    """Points (3, h, w) mm relative to the surface's mean: right and up in the image, and height towards the camera."""
     seen = (surface_mm - np.nanmean(surface_mm.reshape(-1, 3), axis=0)) @ camera_from_robot.T
     return np.moveaxis(seen * (1.0, -1.0, -1.0), -1, 0)

@@ -1,4 +1,4 @@
-"""Figures of notebook 02 about shift: frames unlike those of the training, and real ones."""
+"""Figures of notebook 02 about distribution shift: images unlike those of the training, and real ones."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from notebooks.figures.style import COLOURS, figure, show_image
 def rung_page(
     evaluation: Evaluation, images: Sequence[np.ndarray], order: Sequence[int] | None = None, *, columns: int = 6
 ) -> Figure:
-    """Images round their tools, the largest error first or in the `order` given: circles are detections, crosses labels.
+    """Images, cut to the surroundings of the tool, in the given `order`; None = the largest error first.
 
-    A title has the largest error in per cent of the tool's length, and the lowest confidence; red: sure and wrong.
+    Circles are detections, crosses labels.  A title gives the largest error in per cent of the tool's length, and the lowest
+    confidence.  It is red if a landmark has a confidence of 0.9 or more and an error above a fifth of the length.
     """
     relative = np.nan_to_num(evaluation.error_px / evaluation.length_px[:, None], nan=-1.0, posinf=1e9).max(axis=1)
     order = np.argsort(-relative, kind="stable") if order is None else order
@@ -46,7 +47,7 @@ def rung_page(
 
 
 def recorded_bars(table: Table) -> Figure:
-    """PCK of each rung of `notebooks/studies/rungs`, and what is sure and wrong; far and real families apart from near."""
+    """PCK of each rung of `notebooks/studies/rungs` that has labels, and the share of the sure landmarks that are wrong."""
     rows = [row for row in table.rows if np.isfinite(row.get("pck_0.2_percent", np.nan))]
     fig, (a, b) = figure(1, 2, width_in=11, height_in=0.3 * len(rows) + 1.2, sharey=True, width_ratios=(2, 1))
     y = np.arange(len(rows))
@@ -58,13 +59,13 @@ def recorded_bars(table: Table) -> Figure:
     a.set_yticks(y, [row["rung"].replace("_", " ") for row in rows])
     a.invert_yaxis()
     a.set(xlabel="%", xlim=(0, 101), title="Found")
-    b.set(xlabel="% of the sure ones", title="Sure and wrong")
+    b.set(xlabel="% of the sure landmarks", title="Sure and wrong")
     a.legend(loc="lower left", bbox_to_anchor=(0, 1.06), ncols=2)
     return fig
 
 
 def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
-    """PCK on real frames, a curve a detector."""
+    """PCK on real frames against the threshold, one curve for each detector."""
     fig, ax = figure(width_in=7, height_in=3.5)
     for (name, curve), colour in zip(curves.items(), ("paper", "ours", "truth"), strict=False):
         ax.plot(thresholds, curve, "o-", color=COLOURS[colour], ms=4, label=name)

@@ -1,4 +1,4 @@
-"""The look that all figures share: colours, sizes, image panels."""
+"""The style that all figures share: colours, sizes, image panels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from lib import correspondences
 
-#: Colour-blind safe (after Okabe and Ito), 3:1 and more on white, named by what they mean here.
+#: Colours named by their meaning: safe for colour-blind readers (after Okabe and Ito), contrast at least 3:1 on white.
 COLOURS = {
     "ours": "#0072B2",
     "paper": "#D55E00",
@@ -23,9 +23,9 @@ COLOURS = {
     "right": "#CC79A7",
     "warning": "#C77700",
 }
-#: Legible on dark images and on white.
+#: Colours of the landmarks, legible on dark images and on white.
 LANDMARK_COLOURS = {name: "#{:02X}{:02X}{:02X}".format(*colour) for name, colour in correspondences.LANDMARK_COLOURS.items()}
-#: Of a legend that lies on an image.
+#: Style of a legend that lies on an image.
 ON_IMAGE = {"labelcolor": "white", "frameon": True, "facecolor": "black", "framealpha": 0.55, "edgecolor": "none"}
 
 _RC = {
@@ -46,18 +46,18 @@ _RC = {
     "legend.frameon": False,
     "image.cmap": "viridis",
 }
-plt.rcParams.update(_RC)  # at import, so that titles and labels that a notebook sets later take the look too
+plt.rcParams.update(_RC)  # at import, so that titles and labels that a notebook sets later get the style, too
 
 
 def figure(
     rows: int = 1, columns: int = 1, *, width_in: float = 10.0, height_in: float = 4.0, **subplots
 ) -> tuple[Figure, np.ndarray | Axes]:
-    """A figure in the workbench's look; `subplots` goes to `matplotlib.pyplot.subplots` (squeezed as there)."""
+    """A figure in this style, and its axes; `subplots` are further arguments of `matplotlib.pyplot.subplots`."""
     return plt.subplots(rows, columns, figsize=(width_in, height_in), layout="constrained", **subplots)
 
 
 def show_image(axes: Axes, image: np.ndarray, title: str = "") -> Axes:
-    """An image without ticks or grid, pixel centres on integers."""
+    """Show an image without ticks or grid; pixel centres are at integer coordinates."""
     axes.imshow(image, cmap="gray" if image.ndim == 2 else None, interpolation="antialiased")
     axes.set(xticks=[], yticks=[], title=title)
     axes.grid(False)
@@ -67,10 +67,10 @@ def show_image(axes: Axes, image: np.ndarray, title: str = "") -> Axes:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> HTML:
-    """Rows of text under a header, as HTML: they can be searched, copied and read on a small screen."""
+    """A table of text as HTML, which can be searched, copied and read on a small screen."""
     lines = [("th", header), *(("td", row) for row in rows)]
     body = "".join(
         f"<tr>{''.join(f'<{kind}>{html.escape(str(entry))}</{kind}>' for entry in row)}</tr>" for kind, row in lines
     )
-    # Wide tables scroll by themselves and leave the page in its place.
+    # A wide table scrolls on its own, so that the page need not.
     return HTML(f'<div style="overflow-x:auto"><table><caption>{html.escape(caption)}</caption>{body}</table></div>')
