@@ -74,9 +74,12 @@ def _become(command: list[str]) -> int:
 
 def test(argv: list[str]) -> int:
     """Check the style, then run the tests; `argv` goes to pytest."""
+    from lib.parallel import cores
+
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
+    workers = f"--numprocesses={cores() + 1}"  # one more than there are cores: some tests wait for other processes
     plugins = ["-p", "xdist", "-p", "hypothesispytest"]
-    return _pytest([*plugins, "--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
+    return _pytest([*plugins, workers, "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:
@@ -96,7 +99,9 @@ def _pytest(argv: list[str]) -> int:
     keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays reuse freed memory
     keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # loading every installed plugin takes time
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
-    return subprocess.call(command, env=keep | os.environ)
+    environ = keep | os.environ
+    environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without bytecode each worker compiles all tests anew, for seconds
+    return subprocess.call(command, env=environ)
 
 
 def _call(name: str, argv: list[str]) -> int:
