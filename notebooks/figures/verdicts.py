@@ -56,8 +56,8 @@ def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Cali
         report.stop(f"The calibration of this recording is not trustworthy. {left_out} {anyway}")
     if affine and not assessed.calibration.pair.is_affine:
         report.stop(
-            "The cameras of this recording have a finite distance. The steps of this notebook hold for affine cameras only, so "
-            "its rest is left out. Notebooks 00 and 07 reconstruct with cameras at a finite distance."
+            "The cameras of this recording have a finite distance. The steps of this notebook hold for affine cameras "
+            "only, so the rest is left out. Notebooks 00 and 07 reconstruct with cameras at a finite distance."
         )
     return assessed.calibration
 
@@ -70,7 +70,7 @@ def labelled_pairs(recording: Recording) -> int:
 
 
 def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
-    """The assessment of a recording by its labels; if these are few, its cures ask for more labels, not more frames."""
+    """An assessment by labels; if these are few, its cures ask for more labels, not more frames."""
     pairs = labelled_pairs(recording)
     if pairs >= min(_ENOUGH_LABELS, len(recording)):
         return assessed
