@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 _DPI = 80
-#: About as many pictures travel to a page, each drawn in the run.
+#: About the number of pictures that a page contains for each figure; the run draws them all.
 _STILLS = 5
-#: Widest image of a pair that moves by its own script.
+#: Largest width of an image that a page embeds for `swipe` and `epipolar_pointer`.
 _WIDEST_PX = 960
 
 
 class _Explorer(VBox):
-    """Controls over a picture; where a page is made, also pictures that the page's own sliders choose from."""
+    """Controls above a picture; if a page is made, also pictures from which the sliders of the page choose."""
 
     still_html = ""
 
@@ -42,19 +42,19 @@ class _Explorer(VBox):
 
 
 def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
-    """The figure `draw(name=value, ...)` below its controls, drawn anew when one of them changes.
+    """The figure `draw(name=value, ...)` below its controls; it is drawn again when one of them changes.
 
-    Not `ipywidgets.interact`: an executing client that captures large outputs of a widget may wait for ever.  In a run
-    that makes pages, a few values of each control are drawn too, so that the page's sliders work without a kernel.
+    This is not `ipywidgets.interact`, because a client that captures large widget outputs may then wait for ever.  A run that
+    makes pages also draws a few values of each control, so that the sliders of the page work without a kernel.
 
     Args:
-        draw: Makes a figure; it is closed here.  The first line of its docstring says what the picture shows.
+        draw: Makes a figure, which is closed here.  The first line of its docstring describes the picture.
         knobs: For each argument of `draw` a widget with a value, such as an `IntSlider`.  A widget without a
             description is described by the argument's name.
     """
     for name, knob in knobs.items():
         knob.description = knob.description or name.replace("_", " ")
-        knob.style.description_width = "initial"  # else a longer one is cut off
+        knob.style.description_width = "initial"  # otherwise a long description is cut off
     defaults = {name: knob.value for name, knob in knobs.items()}
 
     def drawn(format: str = "png", **changed: object) -> tuple[bytes, int]:
@@ -66,7 +66,7 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
         return buffer.getvalue(), width
 
     value, width = drawn()
-    # In its own size: stretched to the width of the cell it would be blurred.
+    # At its own size: if stretched to the width of the cell, it would be blurred.
     picture = Image(value=value, format="png", layout=Layout(width=f"{width}px", max_width="100%", height="auto"))
 
     def redraw(_: object) -> None:
@@ -84,7 +84,7 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
 def _stills(
     shows: str, knobs: dict[str, DescriptionWidget], defaults: dict[str, object], png: bytes, drawn: Callable[..., bytes]
 ) -> str:
-    """Pictures of a few values of each control, the others at their defaults, and a slider a control to choose."""
+    """HTML: pictures of a few values of each control, the others at their defaults, and a slider for each control."""
     pictures, sliders = [("default", "at the defaults", png)], []
     for name, knob in knobs.items():
         values = _some_values(knob, max(3, _STILLS // len(knobs)))
@@ -103,12 +103,12 @@ def _stills(
         f' src="data:image/{"png" if at == "default" else "webp"};base64,{base64.b64encode(data).decode("ascii")}">'
         for at, said, data in pictures
     )
-    told = "A few values of each control, the others at their defaults; in JupyterLab every value."
+    told = "This page shows a few values of each control, the others at their defaults. JupyterLab shows every value."
     return f'<div class="explore">{"".join(sliders)}{images}<p class="interactive">{told}</p></div>'
 
 
 def _some_values(knob: DescriptionWidget, n: int) -> list[tuple[str, object]]:
-    """(text, value) of up to n values of a control over its range, its own among them, in order."""
+    """(text, value) of up to n values over the range of a control, in order; they include the current one."""
     if hasattr(knob, "options"):
         found = [(str(text), value) for text, value in knob._options_full]
         at = found.index(next(entry for entry in found if entry[1] == knob.value))
@@ -141,10 +141,10 @@ def swipe(left: np.ndarray, right: np.ndarray, shows: str) -> HTML:
 
 
 def epipolar_pointer(left: np.ndarray, right: np.ndarray, F: np.ndarray, start_px: np.ndarray, shows: str) -> HTML:
-    """Two images; the right one shows the epipolar line of the left pixel under the pointer, without scripts of the first.
+    """Two images; the right one shows the epipolar line of the pixel under the pointer, or of `start_px` without scripts.
 
     Args:
-        F: (3, 3), whose F @ [x, y, 1] is the line a x + b y + c = 0 in the right image.
+        F: (3, 3) fundamental matrix; F @ [x, y, 1] = [a, b, c] is the line a x + b y + c = 0 in the right image.
         start_px: (2,) the first pixel.
     """
     height, width = left.shape[:2]
@@ -171,7 +171,7 @@ def epipolar_pointer(left: np.ndarray, right: np.ndarray, F: np.ndarray, start_p
 
 
 def _embedded(image: np.ndarray) -> str:
-    """An RGB image as the address that a page embeds, at most `_WIDEST_PX` wide."""
+    """An RGB image as a data URL, at most `_WIDEST_PX` wide."""
     height, width = image.shape[:2]
     if width > _WIDEST_PX:
         image = cv2.resize(image, (_WIDEST_PX, round(height * _WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
@@ -180,7 +180,7 @@ def _embedded(image: np.ndarray) -> str:
 
 
 def show_scene(view: go.Figure, caption: str) -> None:
-    """A plotly scene that turns under the mouse, with a picture of it for readers whose page runs no scripts."""
+    """Display a plotly scene that the mouse turns, with a picture of it for pages without scripts."""
     buffer = io.BytesIO()
     page = still(view)
     page.savefig(buffer, format="png")
@@ -194,7 +194,7 @@ def show_scene(view: go.Figure, caption: str) -> None:
 
 
 def still(view: go.Figure) -> Figure:
-    """The meshes and lines of a plotly scene from its own camera, as parallel rays see them."""
+    """A picture of the meshes and lines of a plotly scene, in parallel projection from the direction of its camera."""
     camera = view.layout.scene.camera
     eye, up = (np.array([point.x, point.y, point.z], dtype=float) for point in (camera.eye, camera.up))
     ahead = -eye / np.linalg.norm(eye)

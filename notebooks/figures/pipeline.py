@@ -1,4 +1,4 @@
-"""Figures of notebook 06: the run frame by frame, seconds of the stages, errors, and a frame's dashboard."""
+"""Figures of notebook 06: the run frame by frame, times of the stages, errors, and the dashboard of a frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
-#: What a registration found, in words.
+#: `MovedCameras.moved` -> what the registration found, in words.
 MOVED = {
     "none": "no camera moved", "shifted": "both cameras shifted together", "together": "both cameras moved together",
     "left": "the left camera moved", "right": "the right camera moved", "apart": "the cameras moved apart",
@@ -29,7 +29,7 @@ _STAGE_COLOURS = dict(
 
 
 class Film(Figure):
-    """Pages (h, w, 3) uint8 one after the other: the PNG of this figure moves."""
+    """An animation of pages (h, w, 3) uint8, one every `seconds`; it is saved as an animated PNG."""
 
     def __init__(self, pages: Sequence[np.ndarray], *, seconds: float = 0.4) -> None:
         height, width = pages[0].shape[:2]
@@ -40,7 +40,7 @@ class Film(Figure):
         self._shown = axes.imshow(pages[-1])
 
     def savefig(self, file, **options) -> None:
-        """Write the pages as an animated PNG of few colours."""
+        """Write the pages as an animated PNG of at most 256 colours a page."""
         drawn = []
         for page in self._pages:
             self._shown.set_data(page)
@@ -88,14 +88,14 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
     shown = {result.state for result in results}
     patches = [Patch(facecolor=_STATE_COLOURS[s], edgecolor="#cccccc", label=s) for s in _STATE_COLOURS if s in shown]
     handles = axes[2].get_legend_handles_labels()[0] + patches
-    page.legend(handles=handles, loc="outside lower center", ncols=len(handles))  # outside: curves go everywhere
+    page.legend(handles=handles, loc="outside lower center", ncols=len(handles))  # outside, since the curves fill the axes
     return page
 
 
 def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Figure:
-    """A row for each stage and one for the whole frame: a dot for each frame that it ran in, its median as a bar and in ms.
+    """Times of each stage and of the whole frame, one row each: a dot for each frame in which it ran, and the median.
 
-    The scale is logarithmic; the first two frames, which warm up, are rings.
+    The scale is logarithmic.  The first two frames, which include the warm-up, are rings.
     """
     rows = {stage: [(r.index, r.seconds[stage]) for r in results if stage in r.seconds] for stage in STAGES}
     rows["whole frame"] = [(r.index, sum(r.seconds.get(stage, 0.0) for stage in STAGES)) for r in results]
@@ -113,7 +113,7 @@ def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Fig
         ax.text(1.01, k, said, transform=ax.get_yaxis_transform(), va="center")
     ax.axvline(1e3 / paper_hz, color=COLOURS["paper"], linestyle="--", label=f"paper, whole frame: {1e3 / paper_hz:.0f} ms")
     ax.set_yticks(range(len(rows)), rows)
-    ax.set(xscale="log", xlabel="time of a frame (ms); bar and number: median", ylim=(len(rows) - 0.4, -0.6))
+    ax.set(xscale="log", xlabel="time in a frame (ms); bar and number: median", ylim=(len(rows) - 0.4, -0.6))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.grid(axis="y", visible=False)
     page.legend(loc="outside upper right")
@@ -123,7 +123,7 @@ def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Fig
 def error_timeline(
     results: Sequence[FrameResult], errors_um: Mapping[str, np.ndarray], *, bump_at: int | None = None
 ) -> Figure:
-    """Errors against the truth, frame by frame, on a logarithmic scale; NaN where there is none yet."""
+    """Errors against the truth (name -> one per result, um; NaN = unknown) frame by frame, on a logarithmic scale."""
     page, ax = figure(1, 1, width_in=12, height_in=3.6)
     _shade_states(ax, results)
     colours = (COLOURS["ours"], COLOURS["truth"], COLOURS["paper"], COLOURS["baseline"])
@@ -131,7 +131,7 @@ def error_timeline(
         known = np.flatnonzero(np.isfinite(error))
         if not len(known):
             continue  # nothing to draw, and nothing for the legend
-        # A surface is made in every third frame: a line joins such neighbours, and is broken where more are missing.
+        # If only every third frame has a surface, a line still joins these; it is broken where more frames are missing.
         breaks = np.flatnonzero(np.diff(known) > np.diff(known).min(initial=len(error))) + 1
         for k, part in enumerate(np.split(known, breaks)):
             index = [results[i].index for i in part]
@@ -151,7 +151,7 @@ def error_timeline(
 def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     """One frame: the left image with landmarks and matched points coloured by height, and the surface with the tool.
 
-    Heights are along the view, towards the camera, above the lowest point.
+    A height in mm is measured along the view, towards the camera, from the lowest point of the surface.
     """
     page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.35, 1])
     show_image(axes[0], left, f"Frame {result.index}: {result.state}")
@@ -178,7 +178,7 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
         dots = axes[0].scatter(*u[shown].T, c=h, s=3, vmin=0, vmax=np.nanmax(height), cmap="viridis")
         page.colorbar(dots, ax=axes[0], label="height in mm", shrink=0.8)
     axes[1].remove()
-    # Drawn in the order given: by its own depth order matplotlib hides the tool behind the surface that it is above.
+    # Drawn in the order of the calls: matplotlib's own depth order would hide the tool behind the surface below it.
     scene = page.add_subplot(axes[1].get_subplotspec(), projection="3d", computed_zorder=False)
     scene.plot_surface(seen[..., 0], -seen[..., 1], height, cmap="viridis", linewidth=0, antialiased=True, alpha=0.9)
     tool = np.where(np.isfinite(result.landmarks.x_mm), result.landmarks.x_mm, result.x_tool_mm)
@@ -202,11 +202,14 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
 
 
 def frame_browser(left: Callable[[int], np.ndarray], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
-    """A slider over the frames, `left` of their numbers, with their dashboards; without a browser it shows `start`."""
+    """A slider over the dashboards of all frames; without a browser it shows frame `start`.
+
+    `left` returns the left image (h, w, 3) uint8 of a frame number.
+    """
     slider = IntSlider(value=start, min=0, max=len(results) - 1, continuous_update=False)
 
     def look(frame: int) -> Figure:
-        """A frame with what the pipeline found in it, and the surface with the tool above it."""
+        """A frame with its landmarks and matched points, and the surface with the tool above it."""
         return dashboard(left(frame), results[frame])
 
     return explore(look, frame=slider)

@@ -17,10 +17,10 @@ from notebooks.studies.scenes import Checkerboard, checkerboard_poses
 
 @dataclass(frozen=True)
 class SeenBoard:
-    """Corners that OpenCV found in a stereo pair, (n, 2) px in each image, and where they are, (n, 3) mm robot frame.
+    """Corners that OpenCV found in a stereo pair, (n, 2) px in each image, and their true positions, (n, 3) mm robot frame.
 
     The corners of an image are in the order of `corners_mm` or reversed: a board with odd numbers of inner corners looks the
-    same from its other end.
+    same when rotated by half a turn.
     """
 
     u_left: np.ndarray
@@ -30,14 +30,14 @@ class SeenBoard:
 
 @dataclass(frozen=True)
 class BoardError:
-    """RMS 3D distance (um) of triangulated corners to the known grid.
+    """RMS 3D distance (um) of triangulated corners from the known grid.
 
     Attributes
     ----------
     aligned_um:
         After rigid alignment (no scale): the paper's experiment.
     robot_um:
-        To the true corners in the robot frame, nothing aligned.
+        From the true corners in the robot frame, without alignment.
     """
 
     aligned_um: float
@@ -50,7 +50,7 @@ def render_boards(count: int = 4, microscope: Microscope | None = None, *, seed:
     Parameters
     ----------
     count:
-        Poses, drawn within the field and depth of field; boards that OpenCV does not find are left out.
+        Number of poses, drawn within the field and depth of field; boards that OpenCV does not find are left out.
     microscope:
         None is the reference microscope.
 
@@ -81,7 +81,7 @@ def measure(rig: StereoRig, boards: list[SeenBoard]) -> BoardError:
     aligned, robot = [], []
     for board in boards:
         u_left, corners = board.u_left, board.corners_mm
-        # The epipolar geometry tells which order of the right corners belongs to the left ones.
+        # The epipolar geometry decides which order of the right corners matches the left ones.
         orders = (board.u_right, board.u_right[::-1])
         u_right = min(orders, key=lambda u: np.square(rig.epipolar_distance(board.u_left, u)).sum())
         x = rig.triangulate(u_left, u_right).x_mm

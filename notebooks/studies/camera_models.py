@@ -1,4 +1,4 @@
-"""Which model do the data ask for: likelihood-ratio tests and BIC over the ladder."""
+"""Which camera model do the data need?  Likelihood-ratio tests and BIC over nested models."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from lib.calibration.estimate import calibrate
 from lib.calibration.models import Model
 from lib.correspondences import Correspondences
 
-#: Each model's next freer one, whose likelihood-ratio test asks whether the constraint between them holds; from the stiffest
-#: to the freest.  A pair's cameras have their own zoom, so `common_zoom` is the first to fall.
+#: Each model -> the next more general one; a likelihood-ratio test of the two decides whether the constraint holds.  The
+#: order is from the most constrained model on.  The cameras of a pair differ in zoom, so `common_zoom` is the first to fail.
 _FREER = {
     "common_zoom": "square", "square": "zero_skew", "zero_skew": "affine", "affine": "affine+distance",
     "square+distance": "zero_skew+distance", "zero_skew+distance": "zero_skew+distances", "zero_skew+distances": None,
@@ -24,11 +24,11 @@ LADDER = tuple(_FREER)
 
 @dataclass(frozen=True)
 class Rung:
-    """One model on the data: its name, its number of `parameters` and the fit.
+    """One model fitted to the data: its name, its number of `parameters` and the fit.
 
     Attributes:
-        chi_square, bic: Twice the energy at the common noise levels; plus parameters ln(number of pixel coordinates).
-        against, p_value: The freer model it is nested in; probability of a larger likelihood ratio if nothing is lost.
+        chi_square, bic: Twice the energy at the common noise levels; this plus parameters * ln(number of pixel coordinates).
+        against, p_value: The model in which it is nested; probability of a larger likelihood ratio if the constraint is true.
     """
 
     model: str
@@ -42,7 +42,7 @@ class Rung:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All rungs at the noise levels of the freest, and the model that BIC chooses."""
+    """All models at the noise levels of the most general one, and the model that BIC chooses."""
 
     rungs: list[Rung]
     sigma_u_px: float
@@ -50,7 +50,7 @@ class Comparison:
 
     @property
     def best(self) -> Rung:
-        """The rung of least BIC."""
+        """The model with the smallest BIC."""
         return min(self.rungs, key=lambda rung: rung.bic)
 
     def __getitem__(self, model: str) -> Rung:
@@ -71,9 +71,9 @@ def compare_models(
 ) -> Comparison:  # fmt: skip
     """Fit every model on the same rows with the same noise levels, and compare.
 
-    Rows, offsets and noise levels are those of the freest model (most parameters), so a model error shows as chi-square
-    instead of hiding in larger noise.  `data`, `u`, `options` and errors are those of `calibrate`; of a single camera the
-    models that tie two cameras are left out.
+    Rows, offsets and noise levels are those of the most general model (most parameters), so a model error increases
+    chi-square instead of the noise level.  `data`, `u`, `options` and errors are those of `calibrate`.  For a single camera
+    the models that constrain two cameras are left out.
 
     For example ``compare_models(data, models=("common_zoom", "square", "affine")).best.model``.
     """
@@ -84,7 +84,7 @@ def compare_models(
     freest = calibrate(data, u, model=most, **options)
     rows, covariance = freest.inliers, freest.covariance_px2
     x, pixels = freest.x_mm[rows], np.split(freest.y_px[rows], cameras, axis=1)
-    if cameras == 2:  # the views that the freest model uses, and no others
+    if cameras == 2:  # only the views that the most general model uses
         pixels = [np.where(used[:, None], u, np.nan) for used, u in zip(freest.view_inliers[rows].T, pixels, strict=True)]
         x, pixels = Correspondences.of_points(x, *pixels), None
     same = {

@@ -1,4 +1,4 @@
-"""Perspective cameras by DLT, which the studies compare with affine ones."""
+"""Perspective cameras by DLT, with which the studies compare affine ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rms(error: ArrayLike) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PerspectiveCamera:
-    """u = P [x; 1], dehomogenised; `matrix` (3, 4)."""
+    """A perspective camera: u is P [x; 1], dehomogenised, with the `matrix` P (3, 4)."""
 
     matrix: np.ndarray
 
@@ -49,7 +49,7 @@ def perspective_dlt(x_mm: ArrayLike, u: ArrayLike) -> PerspectiveCamera:
     Raises
     ------
     ValueError
-        For rows that are not finite, or fewer than six.
+        If a row is not finite, or there are fewer than six.
     """
     x, u = finite_points(x_mm, 3, "x_mm"), finite_points(u, 2, "u")
     if len(x) < 6:
@@ -64,7 +64,7 @@ def perspective_dlt(x_mm: ArrayLike, u: ArrayLike) -> PerspectiveCamera:
 
 
 def _normalised(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Similarity to zero mean and mean distance sqrt(dimension), and the points moved by it."""
+    """The similarity to zero mean and mean distance sqrt(dimension), and the points transformed by it."""
     d = z.shape[1]
     mean = z.mean(axis=0)
     scale = np.sqrt(d) / np.linalg.norm(z - mean, axis=1).mean()
@@ -75,7 +75,7 @@ def _normalised(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangulate_perspective(cameras: Sequence[PerspectiveCamera], u: Sequence[ArrayLike]) -> np.ndarray:
-    """Points (n, 3) mm from pixels (n, 2) a camera: linear triangulation, weighed once by the depths it finds."""
+    """Points (n, 3) mm from pixels (n, 2) of each camera: linear triangulation, then again with weights by depth."""
     u = [points(pixels, 2, "u") for pixels in u]
     weights = [np.ones(len(pixels)) for pixels in u]
     for _ in range(2):

@@ -20,7 +20,7 @@ def _argmax(heatmaps: Tensor, sigma: float = 0.0) -> Tensor:
 
 
 def _square(heatmaps: Tensor, centre: Tensor, radius: int) -> Tensor:
-    """The square (n, k, 2 radius + 1, 2 radius + 1) of cells round each `centre`; NaN beyond the border."""
+    """The square (n, k, 2 radius + 1, 2 radius + 1) of cells around each `centre`; NaN beyond the border."""
     padded = F.pad(heatmaps, [radius] * 4, value=torch.nan)
     side = torch.arange(2 * radius + 1)
     n, k = (torch.arange(size) for size in heatmaps.shape[:2])
@@ -58,7 +58,7 @@ def _dark(heatmaps: Tensor, sigma: float) -> Tensor:
 
 
 _OWN = {"argmax": _argmax, "dark": _dark, "kornia": _kornia}
-#: All five, in the order of the figure.
+#: All five decoders, in the order of the figure.
 DECODERS = ("argmax", "paper", "dark", "kornia", "gauss_newton")
 
 

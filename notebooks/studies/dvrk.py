@@ -1,8 +1,8 @@
 """A real robot: a da Vinci research kit whose tool carries two red spheres, seen by one colour camera.
 
 The data set `dvrk_hand_eye` (Imperial College London, BSD-3) holds 50 frames and the recorded positions of joint 4.
-The spheres sit further along the shaft, which always passes through the robot's base (the remote centre), so a sphere is at
-p + l p / |p| with one unknown length l, estimated with the camera.
+The spheres are on the shaft, which always passes through the origin of the robot's base (the remote centre).  So a sphere
+is at p + l p / |p|, for a joint at p, with one unknown length l, which is estimated with the camera.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class RobotFrames:
     image_size_px: tuple[int, int]
 
     def image(self, row: int) -> np.ndarray:
-        """(h, w, 3) uint8 RGB of the frame in `row`."""
+        """The image (h, w, 3) uint8 RGB of the frame in `row`."""
         return _read(self.folder, int(self.index[row]))
 
 
@@ -43,7 +43,7 @@ def _read(folder: Path, index: int) -> np.ndarray:
 
 
 def read_robot_frames(folder: str | Path) -> RobotFrames:
-    """Find the spheres in every frame of the data set; frames where either is not found are left out.
+    """Find the spheres in every frame of the data set; frames in which one is not found are left out.
 
     Raises
     ------
@@ -72,8 +72,8 @@ def read_robot_frames(folder: str | Path) -> RobotFrames:
 def find_spheres(image: np.ndarray) -> np.ndarray | None:
     """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px; None if not both are there.
 
-    A red region gives a rough circle.  Along 180 rays the steepest fall of redness gives the outline to sub-pixel.
-    A robust fit of a circle ignores the parts where the shaft, highlights or tape cross the outline.
+    A red region gives a rough circle.  Along 180 rays the steepest decrease of redness gives the outline to sub-pixel
+    accuracy.  A robust fit of a circle ignores the parts where the shaft, highlights or tape cross the outline.
     """
     channels = image.astype(np.float32)
     redness = channels[:, :, 0] - np.maximum(channels[:, :, 1], channels[:, :, 2])
@@ -95,7 +95,7 @@ def find_spheres(image: np.ndarray) -> np.ndarray | None:
 
 
 def _edge(redness: np.ndarray, circle: np.ndarray, reach_px: float = 6.0, rays: int = 180) -> np.ndarray:
-    """Points (m, 2) of steepest fall of redness along rays about the circle."""
+    """Points (m, 2) of the steepest decrease of redness along rays, near the circle."""
     angle = np.linspace(0, 2 * np.pi, rays, endpoint=False)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])
     offsets = np.arange(-reach_px, reach_px + 0.25, 0.5)
@@ -115,7 +115,7 @@ def _edge(redness: np.ndarray, circle: np.ndarray, reach_px: float = 6.0, rays: 
 
 
 def _fit_circle(points: np.ndarray, scale_px: float, start: np.ndarray | None = None) -> np.ndarray:
-    """x, y, radius of the circle with Cauchy's loss on the radial distances."""
+    """x, y, radius of the circle that minimises Cauchy's loss of the radial distances."""
     if start is None:
         A = np.column_stack([2 * points, np.ones(len(points))])
         x, y, c = np.linalg.lstsq(A, (points**2).sum(axis=1), rcond=None)[0]
@@ -144,12 +144,12 @@ class SphereFit:
 
     @property
     def leave_one_out_rms_px(self) -> float:
-        """RMS of a pixel coordinate, each frame predicted by the others."""
+        """RMS error of a pixel coordinate, each frame predicted from the others."""
         return float(np.sqrt((self.leave_one_out_px**2).mean()))
 
     @property
     def focal_px(self) -> float:
-        """Zoom over 1/distance: the focal length of the pinhole camera this is; infinite for an affine camera."""
+        """Zoom over 1/distance: the focal length of the equivalent pinhole camera; infinite for an affine camera."""
         distance, _ = self.calibration.inverse_distance_per_mm
         K = self.calibration.cameras[0].resect().K
         return float(np.sqrt(K[0, 0] * K[1, 1]) / distance) if distance else float("inf")
@@ -163,7 +163,7 @@ def calibrate_sphere(
     image_size_px: tuple[int, int],
     along_shaft_mm: float | None = None,
 ) -> SphereFit:
-    """Camera and length l of one sphere, and leave-one-out residuals: both are estimated anew without each frame.
+    """Estimate the camera and the length l of one sphere; for leave-one-out residuals both are estimated without each frame.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def calibrate_sphere(
     model:
         As in `calibrate`, for one camera.
     along_shaft_mm:
-        l, where it is known.
+        l, if it is known.
     """
     joint, u = np.asarray(joint_mm, dtype=np.float64), np.asarray(u, dtype=np.float64)
     direction = joint / np.linalg.norm(joint, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Recordings of the rungs of shift whose robot errs, and what an adaptation to one is worth by the truth."""
+"""Recordings unlike those of the training, with errors in the robot's report, and the gain by adaptation to one of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from notebooks import real_data
 
 
 def recorded(rung: str, recording_seed: int, pairs: int) -> tuple[Recording, np.ndarray] | None:
-    """The recording of a rung, and where its landmarks are, (n, 2, 3, 2) px; None: the other renderer's is not at hand."""
+    """The recording of a rung, and its true landmarks (n, 2, 3, 2) px; None if that of the other renderer is not at hand."""
     if rung == "other renderer":
         folder = real_data.folder("path_traced")
         if folder is None:
@@ -35,12 +35,12 @@ def recorded(rung: str, recording_seed: int, pairs: int) -> tuple[Recording, np.
 
 
 def erring(recording: Recording, rng: np.random.Generator, *, offset_mm: float, clock_ms: float, missing: float) -> Recording:
-    """The recording with landmarks that are constantly off in the tool's axes, another clock, and samples missing."""
+    """The recording with errors in the log: constant offsets in the tool's axes, another clock, and missing samples."""
     k = recording.kinematics
     offset = rng.normal(size=(3, 3))
     offset *= offset_mm / np.linalg.norm(offset, axis=1, keepdims=True)
     axes = tool_axes(k.x_mm)
-    known = np.flatnonzero(np.isfinite(axes).all(axis=(1, 2)))  # shut jaws have no axes: those of the nearest sample
+    known = np.flatnonzero(np.isfinite(axes).all(axis=(1, 2)))  # shut jaws have no axes: take those of the nearest sample
     axes = axes[known[np.abs(np.arange(len(axes))[:, None] - known).argmin(axis=1)]]
     x = k.x_mm + np.einsum("mij,kj->mki", axes, offset)
     x[rng.random(len(x)) < missing] = np.nan
@@ -48,7 +48,7 @@ def erring(recording: Recording, rng: np.random.Generator, *, offset_mm: float, 
 
 
 def record_gain(found: Adaptation, exact: np.ndarray, image_size_px: tuple[int, int]) -> None:
-    """Record what the detector before and after, and the labels, are off in the frames for judging."""
+    """Record the errors in the frames for judging: of the detector before and after, and of the robot's labels."""
     told = exact[found.frames["judge"]].reshape(-1, 3, 2)
     inside = ((told > -0.5) & (told < np.array(image_size_px) - 0.5)).all(-1)
     length, told = tool_length_px(told), np.where(inside[..., None], told, np.nan)

@@ -1,4 +1,4 @@
-"""Rivals of the L1 solver that notebook 04 and the tests use: Eq. (6) as the paper states it, through cvxpy; and squares."""
+"""Other solvers with which notebook 04 and the tests compare ours: Eq. (6) as printed, by cvxpy; and least squares."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def cvxpy_reference(
     tolerance: float = 1e-9,
     solver: str = "CLARABEL",
 ) -> tuple[L1Solution, float]:
-    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each output, and the solver's own seconds without building its model.
+    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each output, and the solver's seconds without model set-up.
 
     Arguments as for `lib.surface.solver.interior_point`; `solver` is "CLARABEL" or "OSQP".  `duality_gap` is NaN, because
-    the solver's own stopping rule stands for it.
+    the solver has its own stopping rule.
     """
     n, k = x.shape
     w = np.ones((n, k)) if weights is None else weights
@@ -50,7 +50,7 @@ def cvxpy_reference(
 
 
 def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: np.ndarray) -> L1Solution:
-    """The baseline that the L1 norm is there to beat: sum_i (w_i (b_i.c - x_i))^2 + mu c.R.c, in closed form.
+    """The baseline for the L1 norm: the minimum of sum_i (w_i (b_i.c - x_i))^2 + mu c.R.c, in closed form.
 
     `dual` is the gradient of the data term.
     """

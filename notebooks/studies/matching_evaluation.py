@@ -1,4 +1,4 @@
-"""Scores of matches against measured disparity (evaluation only: nothing here is seen by a matcher)."""
+"""Scores of matches against measured disparity, for evaluation only: no matcher uses anything from here."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from lib.matching.result import Matches
 
-#: The confidences of `Matches`, larger is surer.
+#: The confidences of `Matches`; a larger value means a more reliable match.
 CONFIDENCES = ("score", "peak_ratio", "reciprocal")
 
 
@@ -28,7 +28,7 @@ class DisparityScore:
     above_1, above_2, above_4:
         Fraction of the scored matches whose error is above 1, 2, 4 px.
     error_px:
-        (n,) signed errors, and `u_left` (n, 2) where they are.
+        (n,) signed errors, and their left pixels `u_left` (n, 2).
     """
 
     n: int
@@ -42,17 +42,17 @@ class DisparityScore:
 
 
 def non_occluded(disparity_px: ArrayLike, *, tolerance_px: float = 1.0) -> np.ndarray:
-    """Mask (h, w) of the pixels of the left image that the right camera sees too.
+    """Mask (h, w) of the pixels of the left image that the right camera also sees.
 
-    A pixel is hidden when another one of its row with a larger disparity (nearer) lands within `tolerance_px` of
-    the same right column, or when it lands outside the right image.  Unknown disparity (not finite) is False.
+    A pixel is hidden if it lands outside the right image, or if another pixel of its row, nearer by more than `tolerance_px`
+    of disparity, lands in the same right column.  A pixel of unknown disparity (not finite) is False.
     """
     disparity = np.asarray(disparity_px, dtype=np.float32)
     height, width = disparity.shape
     known = np.isfinite(disparity)
     target = np.arange(width, dtype=np.float32) - np.where(known, disparity, np.inf)
     rows, columns = np.nonzero(known & (target >= 0) & (target <= width - 1))
-    # Nearest disparity that lands on each right pixel, spread over both neighbouring columns: no holes by rounding.
+    # Nearest disparity that lands on each right pixel; it counts in both neighbouring columns, so rounding leaves no holes.
     nearest = np.full((height, width + 1), -np.inf, np.float32)
     left = np.floor(target[rows, columns]).astype(np.intp)
     for column in (left, left + 1):
@@ -75,8 +75,8 @@ def score_against_disparity(
     disparity_px:
         (h, w), x_right = x_left - disparity; not finite = unknown.
     flat_window_px, flat_range_px:
-        Score only where the truth is known in a window of this width around the match and varies by no more than
-        `flat_range_px` in it: a patch across a depth step has no single disparity.  None scores all matches that
+        Score only matches for which the truth is known in a window of this width, and varies by at most
+        `flat_range_px` in it, since a patch across a depth step has no single disparity.  None scores all matches that
         are not occluded.
 
     Raises
@@ -99,7 +99,7 @@ def score_against_disparity(
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     scored = np.flatnonzero(inside)[usable[y[inside], x[inside]]]
     u_left = matches.u_left[scored]
-    # Bilinear truth where flat; the nearest pixel otherwise, where interpolation would mix two surfaces.
+    # Bilinear truth where it is flat; otherwise the nearest pixel, since interpolation would mix two surfaces.
     if flat_window_px is None:
         truth = disparity[y[scored], x[scored]]
     else:
@@ -122,16 +122,16 @@ def score_against_disparity(
 
 
 def detection_auc(confidence: ArrayLike, wrong: ArrayLike) -> float:
-    """Probability that a wrong match has the lower confidence of a wrong and a right one, ties counting half.
+    """Probability that a wrong match has a lower confidence than a right one, ties counting half.
 
-    The area under the ROC curve of the confidence as a detector of wrong matches: 1 tells all, 0.5 tells nothing.
+    It is the area under the ROC curve of the confidence as a detector of wrong matches: 1 is perfect, 0.5 is chance.
 
     Parameters
     ----------
     confidence:
-        (n,), larger is surer; NaN (not told) is taken as the least sure.
+        (n,), larger is more reliable; NaN (unknown) counts as the lowest.
     wrong:
-        (n,) bool.  NaN is returned where all or none are wrong.
+        (n,) bool.  The result is NaN if all or none are wrong.
     """
     confidence, wrong = _confidence(confidence), np.asarray(wrong, dtype=bool)
     n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
@@ -144,7 +144,7 @@ def detection_auc(confidence: ArrayLike, wrong: ArrayLike) -> float:
 
 
 def sparsification(confidence: ArrayLike, wrong: ArrayLike, kept: ArrayLike) -> np.ndarray:
-    """Share of wrong matches among the surest `kept` (k,) in (0, 1] of all; among equals, their mean.
+    """Share of wrong matches among the most confident share `kept` (k,) in (0, 1] of all; equal confidences are averaged.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The paper's registration experiment (Sec. V): known projections are moved by a known motion, then registered.
+"""The paper's registration experiment (Sec. V): known cameras are moved by a known motion, then registered.
 
 Notebooks 00, 05 and 06 and the study of registration share it.
 """
@@ -25,25 +25,25 @@ Estimator = Callable[[StereoRig, Correspondences], Registration]
 
 
 def by_points(rig: StereoRig, data: Correspondences, loss: str = "norm") -> Registration:
-    """Eq. (7) (or its sum of squares): the triangulated landmarks are registered to the robot's report of them."""
+    """Register the triangulated landmarks to the robot's report, by Eq. (7) or by least squares."""
     data = data.complete
     return register(rig.triangulate(data.u_left, data.u_right).x_mm, data.x_mm, loss=loss)
 
 
 @dataclass(frozen=True)
 class MotionErrors:
-    """Errors of one estimator after 1, 2, ... frames, a row a trial; NaN where there is no trial or no estimate.
+    """Errors of one estimator after 1, 2, ... frames, one trial a row; NaN if there is no trial or no estimate.
 
     Attributes
     ----------
     n_frames:
         (k,) frames used.
     translation_mm:
-        (trials, k) of a point at the workspace.
+        (trials, k) error of a point in the middle of the workspace.
     euler_rad:
-        (trials, k, 3) about the robot's x, y, z axes.
+        (trials, k, 3) errors about the robot's x, y, z axes.
     stated_mm:
-        (trials, k) standard deviation of that translation, as the estimate states it.
+        (trials, k) standard deviation of that translation, as stated by the estimate.
     """
 
     n_frames: tuple[int, ...]
@@ -53,22 +53,22 @@ class MotionErrors:
 
     @property
     def trials(self) -> np.ndarray:
-        """(k,) trials with an estimate."""
+        """(k,) number of trials with an estimate."""
         return np.isfinite(self.translation_mm).sum(axis=0)
 
     @property
     def translation_rms_um(self) -> np.ndarray:
-        """(k,) root mean square over the trials."""
+        """(k,) RMS translation error over the trials."""
         return 1e3 * np.sqrt(np.nanmean(self.translation_mm**2, axis=0))
 
     @property
     def stated_rms_um(self) -> np.ndarray:
-        """(k,) root mean square over the trials of what the estimates state."""
+        """(k,) RMS over the trials of the stated standard deviations."""
         return 1e3 * np.sqrt(np.nanmean(self.stated_mm**2, axis=0))
 
     @property
     def euler_rms_deg(self) -> np.ndarray:
-        """(k, 3) root mean square over the trials."""
+        """(k, 3) RMS errors of the angles over the trials."""
         return np.rad2deg(np.sqrt(np.nanmean(self.euler_rad**2, axis=0)))
 
 
@@ -90,17 +90,17 @@ def tool_frames(
     Parameters
     ----------
     rig:
-        What the cameras are now (a moved one in the experiment); None is the reference rig.
+        The rig that sees the tool (a moved one in the experiment); None is the reference rig.
     half_size_mm:
-        Half extents of the base's positions in the microscope frame, within the field and the depth of field.
+        Half the size of the box of the base's positions in the microscope frame, within the field and depth of field.
     jaw_mm:
         Length of the jaws, drawn once: one tool.
     opening_rad:
         Angle between the jaws, drawn for each frame.
     outliers:
-        Share of detections replaced by a random pixel up to 100 px away.
+        Share of detections that are shifted at random by up to 100 px per coordinate.
     errors:
-        Of a detector, each frame's drawn from all of them, with the covariances that it stated; in place of `sigma_u_px`.
+        Errors of a detector and their stated covariances, used instead of `sigma_u_px`; a random one for each frame.
     """
     rig = rig or reference_rig()
     jaw = rng.uniform(*jaw_mm)
@@ -150,10 +150,10 @@ def random_motion(
 
 
 def motion_error(estimate: RigidTransform, truth: RigidTransform, centre_mm: np.ndarray) -> tuple[float, np.ndarray]:
-    """How far an estimated motion is off: (translation in mm, Euler angles (3,) in rad).
+    """Error of an estimated motion: (translation in mm, Euler angles (3,) in rad).
 
-    The translation error is that of the point that truly is at `centre_mm` (the workspace): at the robot's origin,
-    which may be far away, it would only repeat the rotation error.
+    The translation error is that of the point that truly is at `centre_mm`, in the workspace.  At the robot's origin, which
+    may be far away, it would mainly show the rotation error.
     """
     residual = estimate.compose(truth.inverse())
     angles = Rotation.from_matrix(residual.R).as_euler("xyz")  # the paper's Phi_X, Phi_Y, Phi_Z
@@ -174,13 +174,11 @@ def simulated_errors(
     Parameters
     ----------
     estimators:
-        Name to estimator; all see the same data.
+        Name -> estimator; all get the same data.
     n_frames:
-        Frames to use, each count from the first frames of the same sequence.
-    outliers:
-        Share of detections replaced by a random pixel up to 100 px away.
-    options:
-        For `tool_frames`, such as sigma_u_px.
+        Numbers of frames, each taken from the start of the same sequence.
+    outliers, options:
+        As in `tool_frames`.
     """
     rig, centre_mm = reference_rig(), ROBOT_FROM_MICROSCOPE.t
     errors = _no_errors(estimators, n_frames, trials)
@@ -200,17 +198,17 @@ def recorded_errors(
     data: Correspondences,
     rng: np.random.Generator,
 ) -> dict[str, MotionErrors]:
-    """The same from a recording, needing no truth: it is the calibrated projections that are moved, by a known motion.
+    """Errors of each estimator in a recording without truth: the calibrated cameras are moved by a known motion.
 
-    Every window of n consecutive frames is one trial, so a recording of m frames has m - n + 1 of them.  Windows
-    overlap, and their errors are alike where they do.
+    Every window of n consecutive frames is one trial, so a recording of m frames has m - n + 1 trials.  Overlapping windows
+    have similar errors.
 
     Parameters
     ----------
     rig:
         Calibrated with other frames than these.
     data:
-        Landmarks of the held-out frames, as detected and as the robot reports them.
+        Landmarks of the held-out frames, detected and reported by the robot.
     """
     frames, centre_mm = np.unique(data.frame), np.nanmean(data.x_mm, axis=0)
     if len(frames) < max(n_frames):
@@ -246,10 +244,10 @@ def _estimate(errors, at, estimators, rig, data, motion, centre_mm) -> None:
 def pushed_images(
     left: np.ndarray, right: np.ndarray, rig: StereoRig, motion: RigidTransform
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A stereo pair as cameras that moved by `motion` would have taken it: warped by what the motion does to images.
+    """The stereo pair that cameras moved by `motion` would have taken, approximated by an affine warp of the images.
 
-    Exact for a shift in any direction, and for a rotation about a camera's own axis.  After other rotations parts of
-    the scene would look different, which no warp can show.
+    For affine cameras this is exact for a shift in any direction, and for a rotation about a camera's own axis.  After other
+    rotations parts of the scene would look different, which no warp can show.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Is this data enough, and where should the tool go next."""
+"""Are these data enough to calibrate, and where should the tool go next?"""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from lib.geometry import finite_points
 
 
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
-    """(steps^3, 3) points of a box in the robot frame, its corners among them.
-    """
+    """A grid of (steps^3, 3) points in a box of the robot frame, including its corners."""
     low, high = finite_points(low_mm, 3, "low_mm")[0], finite_points(high_mm, 3, "high_mm")[0]
     if not (high > low).all():
         raise ValueError(f"high_mm: must be above low_mm in every coordinate, got {low} and {high}.")
@@ -20,18 +19,18 @@ def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarra
 
 
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (count, 3) mm, chosen one after another, whose correspondences raise det(information) most; and log gains.
+    """Positions (count, 3) mm, chosen one by one, whose correspondences increase det(information) most; and the log gains.
 
-    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage: a convex function of
-    the position, so of a box a corner is best.
+    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model the largest leverage is best.  It is a convex
+    function of the position, so in a box a corner is best.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
     J_x, J = calibration.derivatives(x)
-    S = calibration.noise_px2 + calibration.sigma_x_mm**2 * J_x @ J_x.mT  # of a new row's residual
+    S = calibration.noise_px2 + calibration.sigma_x_mm**2 * J_x @ J_x.mT  # covariance of the residual of a new row
     covariance = calibration.parameter_covariance
     chosen, gains = [], []
     for _ in range(count):
-        # D-optimality of one more correspondence at each x: log det(I + S^-1 J C J^T).
+        # D-optimality: gain by one more correspondence at each x, log det(I + S^-1 J C J^T).
         own = J @ covariance @ np.swapaxes(J, 1, 2)
         gain = np.linalg.slogdet(np.eye(S.shape[-1]) + np.linalg.solve(S, own))[1]
         best = int(gain.argmax())
@@ -43,9 +42,9 @@ def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: in
 
 
 def added_error(calibration: Calibration, x_mm: ArrayLike) -> np.ndarray:
-    """(n,) share that calibration adds to the error of a point triangulated at x (n, 3), in its worst direction.
+    """(n,) relative increase of the error of points triangulated at x (n, 3) by the calibration, in the worst direction.
 
-    Below 0.1 over the workspace the data are enough; else `next_positions` says where the tool should go.
+    If it is below 0.1 in the whole workspace, the data are enough; otherwise `next_positions` proposes where to go.
     """
     alone, both = (calibration.point_covariance(x_mm, detection=detection) for detection in (False, True))
     ratio2 = np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1)

@@ -1,4 +1,4 @@
-"""The paper's own detector (Sec. V-B): one network that sees the whole frame, shrunk to one of four resolutions."""
+"""The paper's own detector (Sec. V-B): one network that sees the whole frame, reduced to one of four resolutions."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def shrunk(labelled: LabelledImage, size_px: tuple[int, int]) -> tuple[np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PublishedDetector:
-    """Called as `Detector` is.  The peak of each heatmap is read as the paper does (Eq. 1), and counts, however low.
+    """Called like `Detector`.  The position of each heatmap's peak is computed by Eq. (1); every peak counts, even a low one.
 
     Attributes
     ----------
     network:
-        As `studies/papers_network` trains it.
+        Trained by `studies/papers_network`.
     size_px:
-        (width, height) of the frames it sees.
+        (width, height) of its input.
     """
 
     network: StackedHourglass
@@ -59,12 +59,12 @@ def kept(
 
 
 def load_published(resolution: str) -> PublishedDetector:
-    """What `studies/papers_network` trained at a resolution, with its other parameters as they are.
+    """The detector that `studies/papers_network` trained at a resolution, with its other parameters at their defaults.
 
     Raises
     ------
     ValueError, FileNotFoundError
-        For an unknown resolution, or one that is not trained here.
+        If the resolution is unknown, or was not trained on this machine.
     """
     if resolution not in RESOLUTIONS:
         raise ValueError(f"resolution: {resolution!r} is none of the paper's; choose one of {', '.join(RESOLUTIONS)}.")

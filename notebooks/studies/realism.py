@@ -1,10 +1,10 @@
-"""How similar are simulated and real images?  Image statistics, and a preset that mimics the public in-vivo frames.
+"""How similar are simulated and real images?  Image statistics, and presets that imitate the public in-vivo frames.
 
-The public frames with forceps (Sznitman et al., MICCAI 2012) come from another set-up than the open-sky one: a 640 x 480
+The public frames with forceps (Sznitman et al., MICCAI 2012) come from another set-up than our open-sky one: a 640 x 480
 video camera looks through the pupil at a fifth of the magnification.  The first sequence is lit by a blue endoilluminator,
-the second by a green one.  `in_vivo_window` renders that set-up, so that like is compared with like.  Light, blur and noise
-of the preset (`LIGHTS`) were set by hand on the first half of each sequence and are judged on the second half.  So the
-comparison shows that the renderer can reach such frames; it does not show that it predicts a microscope never seen.
+the second by a green one.  `in_vivo_window` renders that set-up, so that the comparison is fair.  Light, blur and noise of
+the presets (`LIGHTS`) were set by hand on the first half of each sequence and are judged on the second half.  So the
+comparison shows that the renderer can produce such frames; it does not show that it can imitate an unknown microscope.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lib.simulator.texture import EXTENT_MM, fundus_texture
 from lib.simulator.window import Window
 from notebooks.studies.retinal import import_retinal_microsurgery
 
-#: name -> what it is.
+#: name -> description.
 STATISTICS = {
     "luminance_mean": "mean luminance, 0 to 1",
     "luminance_std": "standard deviation of luminance",
@@ -44,19 +44,19 @@ STATISTICS = {
     "sharpness_centre": "mean |Laplacian| of the central ninth",
     "sharpness_border": "mean |Laplacian| of the rest",
 }
-#: What sets a statistic in the simulator, and so may put it elsewhere.
-_EXPOSURE = "the exposure, which a sequence changes with every move of its lamp and the preset draws from one range"
-_DETAIL = "blur, sharpening and noise of the camera, one value a preset, while focus changes within a sequence"
+#: Statistic -> what determines it in the simulator, and so may cause a difference from real images.
+_EXPOSURE = "the exposure, which changes in a sequence with every motion of its lamp; the preset draws it from one range"
+_DETAIL = "blur, sharpening and noise of the camera, one value in each preset, while focus changes within a sequence"
 SET_BY = {
     "luminance_mean": _EXPOSURE,
     "luminance_std": "the hot spot of the lamp and the brightness of the tool against the retina",
-    "luminance_p05": "the darkest of tool, shadow and border of the lit field, which has no border here",
+    "luminance_p05": "tool and shadow, and in real images the border of the lit field, which is not simulated",
     "luminance_p95": _EXPOSURE,
     "red_over_green": "the colour of the lamp, and of the tissue near the tool",
     "blue_over_green": "the colour of the lamp, and of the tissue near the tool",
     "saturated_share": _EXPOSURE + "; white membranes that saturate near the tool have no counterpart here",
     "gradient_mean": _DETAIL,
-    "gradient_kurtosis": "few strong edges: tool, vessels and glints, whose share of a window the preset fixes",
+    "gradient_kurtosis": "few strong edges: tool, vessels and glints, whose share of a window is fixed by the preset",
     "spectrum_slope": _DETAIL,
     "sharpness_centre": _DETAIL,
     "sharpness_border": _DETAIL,
@@ -64,7 +64,7 @@ SET_BY = {
 #: The same for `fundus_windows`.
 FUNDUS_SET_BY = dict.fromkeys(
     STATISTICS,
-    "grain and blotches of the pigment, stronger than in one photograph, and which no optics has blurred yet",
+    "grain and blotches of the pigment, which are stronger than in the photograph, and not blurred by optics",
 ) | {
     name: "the pigment drawn for an eye, and the photograph's own exposure and colour"
     for name in (
@@ -81,7 +81,7 @@ FUNDUS_SET_BY = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Light:
-    """An endoilluminator and its camera, set by hand on the first half of one real sequence.
+    """Parameters of an endoilluminator and its camera, set by hand on the first half of one real sequence.
 
     Attributes
     ----------
@@ -94,11 +94,11 @@ class Light:
     spot_distance_mm, spot_radius_mm:
         Ranges of the hot spot's distance from the jaws, and of its Gaussian radius.
     psf_px, sharpening, noise:
-        Blur at three times the resolution, strength of the camera's unsharp mask, and shot noise at full scale.
+        Blur in px at three times the resolution, strength of the camera's unsharp mask, and shot noise at full scale.
     veil:
-        Share of the light that vitreous and optics scatter, so that it arrives blurred.
+        Share of the light that vitreous and optics scatter, which blurs it.
     contrast:
-        Exponent of the camera's tone curve about the median, applied after gamma.
+        Exponent of the camera's tone curve about the median; 1 = none.
     """
 
     colour: tuple[float, float, float]
@@ -115,7 +115,7 @@ class Light:
     contrast: float
 
 
-#: Name of a sequence -> the lamp that was set on its first half.
+#: Name of a sequence -> the preset that was set on its first half.
 LIGHTS = {
     "seq1": Light((0.70, 1.0, 1.30), 0.26, 0.25, 0.03, 0.4, (1.2, 3.5), (0.8, 1.5), 2.4, 0.9, 0.004, 0.45, 1.0),
     "seq2": Light((0.755, 1.0, 0.55), 0.41, 0.15, 0.33, 0.4, (1.5, 3.0), (1.2, 2.0), 2.6, 0.8, 0.015, 0.18, 1.35),
@@ -158,7 +158,7 @@ def image_statistics(image: np.ndarray) -> dict[str, float]:
 
 
 def _luminance(image: np.ndarray) -> np.ndarray:
-    """(h, w) float32, 0 to 1, of (h, w, 3) uint8 RGB."""
+    """The luminance (h, w) float32, 0 to 1, of an image (h, w, 3) uint8 RGB."""
     return image.astype(np.float32) / 255 @ np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -233,7 +233,7 @@ def in_vivo_window(
     n = fine * size_px
     camera = AffineCamera(np.column_stack([fine * zoom * R[:2], (n - 1) / 2 - fine * zoom * middle]))
     view = render_view(eye, microscope, Window(camera, (n, n)), forceps=forceps, pose=pose)
-    # Under a narrow lamp the image keeps little of the fundus's own colour and takes on the lamp's.
+    # Under a narrow-band lamp the image has little of the fundus's own colour and mostly the lamp's.
     linear = cv2.resize((view.image / 255.0) ** 2.2, (size_px, size_px), interpolation=cv2.INTER_AREA)
     linear += lamp.veil * (cv2.GaussianBlur(linear, (0, 0), 0.1 * size_px) - linear)
     grey = linear @ np.array([0.25, 0.6, 0.15])
@@ -249,7 +249,7 @@ def in_vivo_window(
 
 
 def tool_windows(size_px: int = 360, seed: int = 5) -> dict[str, np.ndarray]:
-    """Each family of tools once, with its landmarks: a cross on the base, a ring round tip 1, a square round tip 2."""
+    """One image of each family of tools, with its landmarks: cross = base, ring = tip 1, square = tip 2."""
     rng, images = np.random.default_rng(seed), {}
     microscope = Microscope(depth_of_field_mm=float("inf"), full_well=float("inf"), vignetting=0.0, gain=((1.0,) * 3,) * 2)
     scene = Ground(kind="smooth", colours=((0.45, 0.45, 0.45), (0.55, 0.55, 0.55)), gloss=0.0, depth_mm=0.0)
@@ -278,7 +278,7 @@ def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> list[dict[str, float | str | bool]]:
-    """A row for each statistic: 5th, 50th and 95th percentile of both, and whether the simulated median lies within."""
+    """A row for each statistic: 5th, 50th and 95th percentile of both; is the simulated median between the real ones?"""
     rows = []
     for name, values in real.items():
         row = {"name": name, "statistic": STATISTICS[name]}
@@ -291,9 +291,9 @@ def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> li
 
 
 def exceptions(rows: list[dict[str, float | str | bool]], set_by: Mapping[str, str] = SET_BY) -> list[str]:
-    """A line for each statistic that `compare` finds outside: by how much, and what sets it in the simulator.
+    """A line for each statistic outside the limits of `compare`: its value, the limit, and what determines it.
 
-    `set_by` says what sets each statistic; the default is for `in_vivo_window`, `FUNDUS_SET_BY` for bare textures.
+    `set_by` has what determines each statistic; the default is for `in_vivo_window`, `FUNDUS_SET_BY` for bare textures.
     """
     lines = []
     for r in rows:
@@ -308,12 +308,12 @@ def exceptions(rows: list[dict[str, float | str | bool]], set_by: Mapping[str, s
 
 
 def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "judged") -> dict[str, list[np.ndarray]]:
-    """Windows around the tool of about `n` real frames, by sequence of the public in-vivo data.
+    """Windows around the tool in about `n` real frames of the public in-vivo data: sequence -> windows.
 
     Parameters
     ----------
     part:
-        "tuned": frames of the first half of each sequence, on which `LIGHTS` was set; "judged": of the second half.
+        "tuned": frames of the first half of each sequence, on which `LIGHTS` was set; "judged": those of the second half.
     """
     if part not in ("tuned", "judged"):
         raise ValueError(f"part: 'tuned' or 'judged', got {part!r}.")
@@ -328,7 +328,7 @@ def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "jud
 
 
 def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px: int = 160) -> tuple[list, list]:
-    """Windows (real, simulated), n each, of a fundus photograph and of procedural textures, at 40 px per mm.
+    """Windows (real, simulated), n each, from a fundus photograph and from procedural textures, at 40 px per mm.
 
     A square photograph of 45 degrees is assumed to show 13 mm of retina; the black surround is left out.
 
@@ -342,7 +342,7 @@ def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px
     height, width = picture.shape[:2]
     if abs(width - height) > 0.02 * height:
         raise ValueError(
-            f"{photograph}: {width} x {height} px, expected a square; crop it to the disc, whose width says its scale."
+            f"{photograph}: {width} x {height} px, expected a square; crop it to the disc, whose width gives the scale."
         )
     if size_px > 6.0 * 40 * np.sqrt(2):
         raise ValueError(f"size_px: a window of {size_px} px does not fit; at most {int(6.0 * 40 * np.sqrt(2))}.")
@@ -354,7 +354,7 @@ def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px
         windows = []
         for k in range(n):
             image = images[k % len(images)]
-            # The window's corners stay within 6 mm of the middle, inside the disc that is shown.
+            # The corners of the window stay within 6 mm of the middle, inside the visible disc.
             radius = (6.0 * 40 - size_px / np.sqrt(2)) * np.sqrt(rng.random())
             angle = rng.uniform(0, 2 * np.pi)
             corner = np.array(image.shape[1::-1]) / 2 + radius * np.array([np.cos(angle), np.sin(angle)]) - size_px / 2
@@ -366,16 +366,16 @@ def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px
 
 @dataclass(frozen=True)
 class Profiles:
-    """Whole distributions of n images, a row an image.
+    """Distributions of n images, one image a row.
 
     Attributes
     ----------
     level, luminance, colour:
-        Bin centres (b,) in 0..1, shares (n, b) of the pixels a bin, and the same of red, green and blue (n, 3, b).
+        Bin centres (b,) in 0..1, shares (n, b) of the pixels in each bin, and the same for red, green and blue (n, 3, b).
     slope, gradient:
         Bin centres (g,) of the luminance's derivative along x, 1/px, and their densities (n, g).
     frequency, power:
-        Cycles per px (f,), and the radially averaged power (n, f) of the luminance about its mean.
+        Cycles per px (f,), and the radially averaged power (n, f) of the luminance minus its mean.
     """
 
     level: np.ndarray

@@ -37,10 +37,10 @@ class MonocularSequence:
         return read_image(self.paths[index], self.image_size_px)
 
     def labelled(self, *, second_half: bool | None = None, every: int = 1) -> Iterator[LabelledImage]:
-        """Of every `every`-th frame those that have a label: of all, of the first half or of the second.
+        """Every `every`-th frame, if it has a label: of the whole sequence, or of its first or second half.
 
-        A landmark without a click counts as unlabelled: nobody says whether it is hidden or outside.
-        Consecutive frames are alike, so halves in time are the honest split.
+        A landmark without a click counts as unlabelled, since it is unknown whether it is hidden or outside.
+        Consecutive frames are alike, so the sequence is split into halves in time.
         """
         middle = len(self) // 2
         for i in {None: range(len(self)), False: range(middle), True: range(middle, len(self))}[second_half][::every]:
@@ -85,8 +85,8 @@ def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
 def label_repeatability(sequence: MonocularSequence, threshold: float = 0.2) -> float:
     """PCK in percent that a detector without error would reach on the second half, since clicks jitter.
 
-    Each click is compared with the mean of those one frame before and after.  If all err alike that difference has 3/2 of
-    one click's variance, and is divided by the root of that.  Uneven motion of the tool adds to it.
+    Each click is compared with the mean of those one frame before and after.  If all clicks have the same variance, this
+    difference has 3/2 of it, so it is divided by sqrt(3/2).  Uneven motion of the tool increases it.
     """
     middle = len(sequence) // 2
     u, number = sequence.u[middle:], np.asarray(sequence.frame_numbers)[middle:]

@@ -1,6 +1,6 @@
-"""The rungs of shift on which a detector is judged: near, far and real frames, near frames changed, and no tool at all.
+"""The kinds of images (rungs) that judge a detector, increasingly unlike those of its training.
 
-Nothing may be chosen by these images.
+They are near, far and real frames, near frames with changes, and images without a tool.  Nothing may be chosen by them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _brightness(factor: float) -> Change:
     return lambda image, rng: (cv2.convertScaleAbs(image, alpha=factor), 1.0)
 
 
-#: Changes of near frames: name -> function of an image that returns the changed one and its scale.
+#: Changes of near frames: name -> function of an image that returns the changed image and its scale.
 CHANGES: dict[str, Change] = {
     "grey": _grey,
     "red and blue swapped": lambda image, rng: (np.ascontiguousarray(image[..., ::-1]), 1.0),
@@ -57,12 +57,12 @@ CHANGES: dict[str, Change] = {
 }
 #: Images without the tool.
 EMPTY = ("empty scenes", "noise", "photographs", "real frames with the tool painted out")
-#: All of them.
+#: All rungs.
 RUNGS = ("near", *FAR, "other renderer", "real seq1", "real seq2", *CHANGES, *EMPTY)
 
 
 def images(rung: str, n: int, *, seed: int = 0, data: Path | None = None) -> Iterator[LabelledImage]:
-    """Up to `n` labelled images of a rung; none where its data set is not at hand (`data`: the folder of real data sets).
+    """Up to `n` labelled images of a rung; none if its data set is not at hand (`data`: the folder of real data sets).
 
     Raises `ValueError` for an unknown rung.
     """
@@ -85,7 +85,7 @@ def images(rung: str, n: int, *, seed: int = 0, data: Path | None = None) -> Ite
 
 
 def _near(n: int, seed: int) -> Iterator[LabelledImage]:
-    """Frames of the shipped recording and, as many again, of other eyes and tools of the reference rig."""
+    """Frames of the shipped recording, and as many of other eyes and tools under the reference rig."""
     recording, half = Recording.open(paths.SHIPPED_RECORDING), n // 2
     own = list(labelled_images(recording, every=max(1, 2 * len(recording.frames) // max(half, 1))))[:half]
     yield from own
@@ -99,7 +99,7 @@ def _empty(name: str, image: np.ndarray) -> LabelledImage:
 
 
 def _noise(rng: np.random.Generator) -> np.ndarray:
-    """White or smooth noise, of any strength, about any colour."""
+    """White or smooth noise of random strength about a random colour."""
     noise = rng.standard_normal((540, 960, 3)).astype(np.float32)
     if rng.random() < 0.7:
         sigma = np.exp(rng.uniform(0, 4))
@@ -137,7 +137,7 @@ def _from_data(rung: str, n: int, data: Path, rng: np.random.Generator) -> Itera
 
 
 def _painted_out(image: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The same frame without the jaws and the shaft, which goes on behind the base."""
+    """The frame with the jaws and the shaft (an extension behind the base) painted out."""
     mask, ahead = np.zeros(image.shape[:2], np.uint8), u[1:].mean(0) - u[0]
     for start, end in ((u[0], u[1]), (u[0], u[2]), (u[0], u[0] - 20 * ahead)):
         cv2.line(mask, *(tuple(int(v) for v in np.round(p)) for p in (start, end)), 255, 34)
@@ -145,9 +145,10 @@ def _painted_out(image: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def numbers(result: Evaluation) -> dict[str, tuple[float, str]]:
-    """What is stated of a rung: name -> (value, unit).
+    """The recorded numbers of a rung: name -> (value, unit).
 
-    A landmark is wrong beyond a fifth of the tool's length; `nees` and `coverage_95` are over those that are not wrong.
+    A landmark is wrong if its error exceeds a fifth of the tool's length.  `nees` and `coverage_95` are computed without the
+    wrong ones.
     """
     found, known = result.landmarks, np.isfinite(result.u_true).all(2) | (result.visibility == 0)
     sure = found.confidence >= 0.9
@@ -172,7 +173,7 @@ def numbers(result: Evaluation) -> dict[str, tuple[float, str]]:
 
 
 def table(rows: Sequence[tuple[str, dict[str, tuple[float, str]]]]) -> str:
-    """Rungs below each other, as text."""
+    """A table of the rungs, one in each line, as text."""
     names = list(dict.fromkeys(name for _, row in rows for name in row))
     lines = ["rung".ljust(30) + "".join(name.rjust(17) for name in names)]
     for rung, row in rows:

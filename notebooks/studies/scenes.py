@@ -20,7 +20,7 @@ class Checkerboard:
     Attributes
     ----------
     microscope_from_board:
-        Its pose; the board's origin is its middle, x along the columns, z into the plate.
+        Pose; the board's origin is its middle, x along the columns, z into the plate.
     """
 
     microscope_from_board: RigidTransform = RigidTransform.identity()  # noqa: RUF009 - immutable

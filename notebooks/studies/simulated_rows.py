@@ -1,4 +1,4 @@
-"""Correspondences as the reference rig sees them, simulated without images."""
+"""Correspondences of the reference rig, simulated without images."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSweep(Correspondences):
-    """`Correspondences` with noise, and the truth beside them: `true_x_mm` (n, 3) and `true_rig`."""
+    """`Correspondences` with noise, and their truth: `true_x_mm` (n, 3) and `true_rig`."""
 
     true_x_mm: np.ndarray
     true_rig: StereoRig
 
     def subset(self, rows: slice | ArrayLike) -> Correspondences:
-        """The rows that a slice, a mask or an array of indices names, without the truth."""
+        """The rows selected by a slice, a mask or an array of indices, without the truth."""
         return Correspondences(**{f.name: getattr(self, f.name) for f in fields(Correspondences)}).subset(rows)
 
 
@@ -30,9 +30,9 @@ def simulate_correspondences(
     half_size_mm: tuple[float, float, float] = (8.0, 4.5, 1.5), sigma_u_px: float = 1.5, sigma_x_mm: float = 0.010,
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
 ) -> SimulatedSweep:  # fmt: skip
-    """`n` positions in a box around the microscope frame's origin, as the rig sees them and the robot reports them.
+    """`n` positions in a box around the microscope frame's origin, detected by the rig and reported by the robot.
 
-    `sigma_u_px` and `sigma_x_mm` are the standard deviations per coordinate; the rows do not state them.
+    `sigma_u_px` and `sigma_x_mm` are the standard deviations per coordinate; they are not stored in the rows.
     """
     rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
     true_x = robot_from_microscope.apply(rng.uniform(-1, 1, (n, 3)) * half_size_mm)

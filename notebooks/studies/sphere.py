@@ -21,9 +21,9 @@ class Sphere:
     inliers: np.ndarray
 
     def along_view(self, u: ArrayLike, camera: AffineCamera, *, bowl: bool = True) -> np.ndarray:
-        """Where the camera's rays through u (n, 2) meet the sphere, (n, 3) mm; NaN where they miss it.
+        """The points (n, 3) mm in which the camera's rays through u (n, 2) meet the sphere; NaN if they miss it.
 
-        `bowl` takes the far side, which an eye seen from within shows; else the near one.
+        `bowl` selects the far side, which is visible in an eye seen from within; otherwise it is the near side.
         """
         d = camera.viewing_direction
         ray = (points(u, 2, "u") - camera.offset_px) @ np.linalg.pinv(camera.linear).T
@@ -36,12 +36,12 @@ class Sphere:
 
 
 def fit_sphere(x_mm: ArrayLike, *, reject_medians: float = 5.0) -> Sphere:
-    """The sphere of least robust distance to points (n, 3): soft L1 loss, one rejection and refit.
+    """Robust fit of a sphere to points (n, 3): soft L1 loss, then rejection of outliers and a second fit.
 
     Raises
     ------
     ValueError
-        For fewer than four points, NaN, or points in a plane.
+        If there are fewer than four points, a NaN, or all points lie in a plane.
     """
     x = finite_points(x_mm, 3, "x_mm")
     if len(x) < 4:

@@ -1,4 +1,4 @@
-"""Simulated recordings at the level of correspondences, good ones and spoiled ones, each with the truth that judges it."""
+"""Simulated correspondences of good and spoiled recordings, each with the truth that judges the workbench."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from lib.recordings import Kinematics
 from lib.simulator import Microscope
 from lib.trust import diagnose, judge
 
-#: First seed of the recordings on which thresholds are set, and of those that are judged once.
+#: First seed of the recordings on which thresholds are set, and of those that only judge.
 SETS = {"setting": 0, "judging": 50_000}
 _SIZE = (1920, 1080)
 
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A recording without its pictures: what a lab would have, and `truth`.
+    """A recording without its images: the data of a lab, and their truth.
 
     Attributes
     ----------
     name, strength, causes:
-        How it was spoiled ("" if it was not) and the names of hypotheses that are right.
+        The fault and its strength ("" if there is none), and the names of the hypotheses that are right.
     data, kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm:
-        What the lab has.
+        The data of the lab.
     rigs, points_mm:
         The true rigs (more than one if a camera moved) and (k, 3) test positions, in the true robot frame.
     """
@@ -52,17 +52,17 @@ class Take:
 
 @dataclass(eq=False)
 class Scene:
-    """Everything that happens in a recording, to be spoiled before or after it is seen."""
+    """The description of a recording; faults change the scene itself, the pixels or the robot's report."""
 
     rng: np.random.Generator
     frames: int = 100
     fps: float = 25.0
     speed_mm_s: float = 3.0
     noise_px: float = 1.2
-    tail: float = np.inf  # degrees of freedom of the detections' errors
-    memory: float = 0.0  # their correlation from frame to frame
+    tail: float = np.inf  # degrees of freedom (Student t) of the detections' errors
+    memory: float = 0.0  # correlation of these errors from frame to frame
     shared: float = 0.0  # and between the landmarks of an image
-    anisotropy: float = 1.0  # by how much larger they are along the rows of the image, with the same RMS
+    anisotropy: float = 1.0  # ratio of the errors along the image rows to those across them, with the same RMS
     bias_mm: float = 0.0  # constant offsets of the detected landmarks
     missing: float = 0.0
     outliers: float = 0.0
@@ -75,15 +75,15 @@ class Scene:
     edit_pixels: list[Callable[[Scene, np.ndarray], np.ndarray]] = field(default_factory=list)
     edit_report: list[Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]] = field(default_factory=list)
     stated_readout_s: float | None = None
-    offset_s: float = 0.0  # by which the stated clock is wrong
-    camera_late_s: tuple[float | np.ndarray, float | np.ndarray] = (0.0, 0.0)  # of each frame, if not of all
-    rate: float = 1.0
-    move: tuple[float, RigidTransform] | None = None  # share of the frames before it, and the motion of the rig
-    drift_px: float = 0.0
-    edit_rig: Callable[[StereoRig], StereoRig] | None = None  # of the microscope
+    offset_s: float = 0.0  # error of the stated offset of the clocks
+    camera_late_s: tuple[float | np.ndarray, float | np.ndarray] = (0.0, 0.0)  # delays of both cameras
+    rate: float = 1.0  # stated times over true times
+    move: tuple[float, RigidTransform] | None = None  # share of the frames before the motion, and the motion of the rig
+    drift_px: float = 0.0  # shift of the images from the first frame to the last
+    edit_rig: Callable[[StereoRig], StereoRig] | None = None  # changes the cameras
 
     def path(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Times (...,) -> base, tip_1, tip_2 (..., 3, 3) mm in the microscope frame."""
+        """A random path of the tool: a function from times (...,) to base, tip_1, tip_2 (..., 3, 3) mm, microscope frame."""
         rng, seconds = self.rng, self.frames / self.fps + 6.0
         steps = int(np.ceil(seconds * self.speed_mm_s / 3.0)) + 4
         knots = np.linspace(-3.0, seconds, steps) + rng.uniform(-0.25, 0.25, steps) * seconds / steps
@@ -108,7 +108,7 @@ class Scene:
         return landmarks
 
     def take(self, name: str = "", strength: str = "", causes: tuple[str, ...] = ()) -> Take:
-        """Film it."""
+        """Simulate the recording: the detections in both images and the robot's report."""
         rng = self.rng
         pose = RigidTransform.from_rotation_vector(
             Rotation.from_rotvec(rng.normal(0, 0.25, 3)).as_matrix() @ np.array([0.15, 2.90, -0.25]), rng.uniform(-30, 30, 3)
@@ -176,17 +176,17 @@ class Scene:
 
 @dataclass(frozen=True)
 class Result:
-    """What the workbench said of a take.
+    """The workbench's result for a take.
 
     Attributes
     ----------
     effect:
-        RMS 3D error of the calibration at the test positions over its stated standard deviation, the worst of the rigs;
-        infinite where the calibration was refused.
+        RMS 3D error of the calibration at the test positions, divided by its stated standard deviation, for the worst of the
+        rigs; infinite if the calibration was refused.
     level, named:
-        Of the verdict; and of the diagnosis, "" where it found nothing.
+        Level of the verdict; cause named by the diagnosis, "" if none.
     text:
-        What the diagnosis says.
+        The diagnosis in words.
     """
 
     take: Take
@@ -197,12 +197,12 @@ class Result:
 
     @property
     def right(self) -> bool:
-        """The cause was named, or nothing where there is none."""
+        """True if the right cause was named, or none if there is no fault."""
         return self.named in (self.take.causes or ("",))
 
 
 def examine(take: Take, fit: Callable[..., Calibration] = calibrate) -> Result:
-    """Calibrate by `fit`, diagnose and judge, as `lib.trust.assess` does; `calibrate` alone keeps cameras affine."""
+    """Calibrate by `fit`, diagnose and judge, as `lib.trust.assess` does; with `fit=calibrate` the cameras are affine."""
     calibration, error, effect = None, None, np.inf
     try:
         calibration = fit(take.data, image_size_px=take.image_size_px)
@@ -355,7 +355,7 @@ def _smoothed(window_s: float) -> Callable[[Scene], None]:
 
 
 def _swaying(size_px: float, views: tuple[int, ...], frames: float = 0.1) -> Callable[[Scene], None]:
-    """Images shift about a point, by so much (RMS), at the pace of some frames; those of two views alike."""
+    """Images shift at random: `size_px` is the RMS per coordinate, `frames` the time scale; two views shift together."""
 
     def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
         shift = gaussian_filter1d(scene.rng.normal(size=(len(u), 1, 2)), frames, axis=0)
@@ -367,7 +367,7 @@ def _swaying(size_px: float, views: tuple[int, ...], frames: float = 0.1) -> Cal
 
 
 def _breathing(share: float, period_s: float, views: tuple[int, ...]) -> Callable[[Scene], None]:
-    """Images grow and shrink about their centre, as those of a lens that hunts for its focus."""
+    """Images grow and shrink about their centre, as with a lens that searches for its focus."""
 
     def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
         centre, phase = (np.array(_SIZE) - 1) / 2, 2 * np.pi * (np.arange(len(u)) / scene.fps / period_s + scene.rng.random())
@@ -379,7 +379,7 @@ def _breathing(share: float, period_s: float, views: tuple[int, ...]) -> Callabl
 
 
 def _jittering(seconds: float) -> Callable[[Scene], None]:
-    """Each pair of images is stamped early or late by some time of its own."""
+    """The time stamp of each pair of images has a random error with the standard deviation `seconds`."""
 
     def apply(scene: Scene) -> None:
         late_s = scene.rng.normal(0, seconds, scene.frames)
@@ -389,12 +389,12 @@ def _jittering(seconds: float) -> Callable[[Scene], None]:
 
 
 def _backlash(size_mm: float) -> Callable[[Scene], None]:
-    """Along each axis the robot is elsewhere by so much where it moves the other way."""
+    """Along each axis the report shifts by `size_mm` when the robot reverses its direction."""
     return _report(lambda scene, t, x: x + 0.5 * size_mm * np.sign(np.gradient(gaussian_filter1d(x, 4, axis=0), axis=0)))
 
 
 def _flange(length_mm: float) -> Callable[[Scene], None]:
-    """The robot reports points that far behind: its tool has no length."""
+    """The robot reports points `length_mm` behind the landmarks, as if the length of its tool were not set."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         along = x[:, 1:].mean(axis=1) - x[:, 0]
@@ -404,7 +404,7 @@ def _flange(length_mm: float) -> Callable[[Scene], None]:
 
 
 def _holding(seconds: float) -> Callable[[Scene], None]:
-    """The robot's log repeats each position for so long."""
+    """The robot's log repeats each position for the given time."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         every = round(seconds / np.median(np.diff(t)))
@@ -414,14 +414,14 @@ def _holding(seconds: float) -> Callable[[Scene], None]:
 
 
 def _exchanged_later(scene: Scene, u: np.ndarray) -> np.ndarray:
-    """From the middle on left is right."""
+    """From a random frame in the middle of the recording on, left and right are exchanged."""
     u, first = u.copy(), round(scene.rng.uniform(0.3, 0.7) * len(u))
     u[first:] = u[first:, :, ::-1].copy()
     return u
 
 
 def _gap(share: float) -> Callable[[Scene], None]:
-    """The log lacks a stretch, and whoever wrote it joined the ends by a line."""
+    """The log lacks a stretch, which is filled by linear interpolation."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         seconds = scene.frames / scene.fps
@@ -436,7 +436,7 @@ def _gap(share: float) -> Callable[[Scene], None]:
 
 
 def _bend(size: float) -> Callable[[Scene], None]:
-    """The tips lag behind the base by `size` of how far the tool is from the middle of the field."""
+    """The reported tips are shifted towards the middle of the field by the share `size` of their distance from it."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         x, middle = x.copy(), x.reshape(-1, 3).mean(axis=0)
@@ -447,7 +447,7 @@ def _bend(size: float) -> Callable[[Scene], None]:
 
 
 def _slip(size_mm: float) -> Callable[[Scene], None]:
-    """From the middle on the robot holds the tool elsewhere along its shaft, and does not know it."""
+    """In the second half the tool has slipped along its shaft by `size_mm`, and the robot's report is wrong by this."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         along = x[:, 1:].mean(axis=1) - x[:, 0]
@@ -472,7 +472,7 @@ def _move(degrees: float) -> Callable[[Scene], None]:
 
 
 def _spikes(share: float) -> Callable[[Scene], None]:
-    """Single samples of the robot lie a few millimetres off."""
+    """Single samples of the robot have errors of a few millimetres."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         return x + (scene.rng.random((len(x), 1, 1)) < share) * scene.rng.normal(0, 3.0, (len(x), 1, 3))
@@ -481,7 +481,7 @@ def _spikes(share: float) -> Callable[[Scene], None]:
 
 
 def _opened(factor: float) -> Callable[[Scene], None]:
-    """The log has the tips `factor` times as far apart, as where half an opening angle is taken for the whole."""
+    """In the log the tips are `factor` times as far apart, as if half the opening angle were taken for the whole."""
 
     def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         middle = x[:, 1:].mean(axis=1, keepdims=True)
@@ -502,12 +502,12 @@ def _lens(strength: float) -> Callable[[Camera], Camera]:
 
 
 def _squeezed(factor: float) -> Callable[[Camera], Camera]:
-    """The width of the image is multiplied."""
+    """The width of the image is multiplied by `factor`."""
     return lambda camera: replace(camera, matrix=camera.matrix * [[factor], [1.0]])
 
 
 def _changing(zoom: float, degrees: float) -> Callable[[Scene], None]:
-    """Both images zoom and turn about their centre at a constant speed, from first to last by so much."""
+    """Both images zoom and rotate about their centre at constant speed, by `zoom` and `degrees` over the recording."""
 
     def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
         part, centre = np.linspace(0, 1, len(u)), (np.array(_SIZE) - 1) / 2
@@ -518,7 +518,7 @@ def _changing(zoom: float, degrees: float) -> Callable[[Scene], None]:
 
 
 def _of_another(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The log of another recording with this robot."""
+    """The log is that of another recording with this robot."""
     other = Scene(np.random.default_rng(scene.rng.integers(1 << 30)), frames=scene.frames, fps=scene.fps)
     return x.mean(axis=(0, 1)) + other.path()(t)
 
@@ -547,18 +547,18 @@ _REVERSE = _report(lambda scene, t, x: x[::-1].copy())
 
 
 def _blank(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """One per cent of the robot's samples are dropped."""
+    """One per cent of the robot's samples are missing."""
     return np.where(scene.rng.random((len(x), 1, 1)) < 0.01, np.nan, x)
 
 
 def _spike(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """One sample of the robot is 1.3 mm off."""
+    """One sample of the robot is off by 1.3 mm in each coordinate."""
     x = x.copy()
     x[scene.rng.integers(200, len(x) - 200)] += 1.3
     return x
 
 
-#: (way, strength) -> (names of hypotheses that are right, how the scene is spoiled).
+#: (fault, strength) -> (names of the hypotheses that are right, function that spoils a scene).
 SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] = {
     **{("clock", f"{ms} ms"): (("clock",), _set(offset_s=ms / 1e3)) for ms in (-20, 183, 383)},
     ("tips exchanged", "both images"): (("tip_order",), _tips((0, 1), 1.0)),
@@ -656,8 +656,8 @@ GOOD: dict[str, dict[str, object]] = {
 def takes(recordings: str = "setting", seed: int = 0, only: str = "", distance_mm: float = np.inf) -> Iterator[Take]:
     """The good and then the spoiled recordings of one set whose names contain `only`.
 
-    A `seed` is another draw of all rigs, tools, paths and noise.  The microscopes have a working distance of `distance_mm`;
-    where it is finite, recordings that only lack that are left out.
+    The `seed` is that of all rigs, tools, paths and noise.  The microscopes have a working distance of `distance_mm`.  If it
+    is finite, the recordings whose only fault is a finite distance are left out.
     """
     for i, (name, options) in enumerate(GOOD.items()):
         if only in name:

@@ -1,4 +1,4 @@
-"""How good a reconstruction is where the truth is known.  Nothing here is seen by an estimator."""
+"""The errors of reconstructions with known truth.  No estimator uses anything from here."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from notebooks.studies.matching_evaluation import (
 from notebooks.studies.scenes import OBJECTS, Relief
 from notebooks.studies.sphere import Sphere, fit_sphere
 
-#: Of `retina_points`: a full-HD image, px.
+#: The domain of `retina_points`: a full-HD image, px.
 DOMAIN = (0.0, 0.0, 1920.0, 1080.0)
 
 TruthSurface = Callable[[np.ndarray], np.ndarray]
@@ -46,7 +46,7 @@ def surface_error_mm(
     *,
     camera: AffineCamera | None = None,
 ) -> np.ndarray:
-    """Psi(u) - truth(u), (len(y), len(x), 3) mm, on a lattice of left pixels; NaN where either has no surface.
+    """Error Psi(u) - truth(u), (len(y), len(x), 3) mm, on a lattice of left pixels; NaN if either has no surface there.
 
     `camera` is needed for a sphere, to find where its rays meet it.
     """
@@ -56,17 +56,18 @@ def surface_error_mm(
 
 
 def rms_um(error_mm: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Root mean square length in um of error vectors (..., 3) mm, over the ones that are finite and `where` (...)."""
+    """Root mean square length in um of error vectors (..., 3) mm, over those that are finite and `where` (...) is true."""
     length = np.linalg.norm(error_mm, axis=-1)
     chosen = np.isfinite(length) if where is None else np.isfinite(length) & where
     return float(1000 * np.sqrt(np.mean(length[chosen] ** 2))) if chosen.any() else float("nan")
 
 
 def aligned_rms_um(error_mm: np.ndarray, truth_mm: np.ndarray, where: np.ndarray | None = None) -> dict[str, float]:
-    """RMS length in um of errors (..., 3) of points `truth_mm` (..., 3): as they are, and after alignment to the truth.
+    """RMS length in um of errors (..., 3) of points `truth_mm` (..., 3), without and with alignment to the truth.
 
-    "robot frame" is what a tool would notice.  "rigid" and "affine" take out the best motion and the best affine map,
-    which is all that a wrong affine calibration of exact matches can cause: what is left is the matching's.
+    "robot frame" is the error without alignment, which matters for a tool.  "rigid" and "affine" are the errors after the
+    best motion and the best affine map.  With exact matches a wrong affine calibration causes an affine map only, so the
+    error after it comes from matching.
     """
     chosen = np.isfinite(error_mm).all(axis=-1) & np.isfinite(truth_mm).all(axis=-1)
     if where is not None:
@@ -90,9 +91,9 @@ def aligned_rms_um(error_mm: np.ndarray, truth_mm: np.ndarray, where: np.ndarray
 def surface_on_rays(
     camera: AffineCamera, height_mm: Callable[[np.ndarray, np.ndarray], np.ndarray], u: np.ndarray
 ) -> np.ndarray:
-    """Where the rays of pixels u (n, 2) meet a surface z = `height_mm(x, y)` of the microscope's frame: (n, 3) mm, robot.
+    """Points (n, 3) mm, robot frame, in which rays of pixels u (n, 2) meet z = `height_mm(x, y)` of the microscope frame.
 
-    The view is all but the microscope's axis, so steps along the ray by the height that is left contract fast.
+    The view is nearly the microscope's axis, so steps along the ray by the remaining height converge fast.
     """
     ray = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
     along = np.full(len(u), float(camera.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))
@@ -105,7 +106,7 @@ def surface_on_rays(
 @dataclass(frozen=True, eq=False)
 class SimulatedPair:
     """Images (h, w, 3) uint8 of one scene, the exact `rig` in the robot frame, and `truth(u)`: the surface point (n, 3) mm
-    that the left camera sees at pixels (n, 2); `eye` tells whether a sphere is a prior for it."""
+    that the left camera sees at pixels (n, 2); `eye` is True if a sphere is a sensible prior."""
 
     name: str
     left: np.ndarray
@@ -118,7 +119,7 @@ class SimulatedPair:
 def simulated_pair(
     name: str, scene: Scene, microscope: Microscope, *, seed: int = 0, eye: bool = True
 ) -> SimulatedPair:
-    """One pair of a scene without a tool; a full-HD pair takes 1.5 CPU seconds, and an eye's texture as much."""
+    """One pair of a scene without a tool; a full-HD pair takes 1.5 CPU seconds, and the texture of an eye another 1.5."""
     views = render_pair(scene, microscope, rng=np.random.default_rng([seed, 109]))
     rig = microscope.rig()
     x_px, y_px, x_mm = surface_grid(
@@ -169,18 +170,18 @@ def full_hd_pair() -> tuple:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A simulated pair, what was reconstructed, and its errors on a lattice of left pixels.
+    """A simulated pair, its reconstruction, and the errors on a lattice of left pixels.
 
     Attributes
     ----------
     x_px, y_px:
         The lattice.
     error_mm:
-        (len(y), len(x), 3) of the surface; `sphere_error_mm` of the sphere prior, None for objects.
+        (len(y), len(x), 3) errors of the surface; `sphere_error_mm` those of the sphere prior, None for objects.
     seen:
         (len(y), len(x)) bool, False under reflections.
     rms_um, sphere_rms_um:
-        3D, over what is seen; `sphere_rms_um` is NaN for objects.
+        3D RMS errors over `seen`; `sphere_rms_um` is NaN for objects.
     """
 
     pair: SimulatedPair
@@ -210,16 +211,16 @@ def case(pair: SimulatedPair, **options) -> Case:
 
 
 def wrong_matches(matches: Matches, truth: TruthSurface, rig: StereoRig, *, limit_px: float = 2.0) -> np.ndarray:
-    """Which matches (n,) end more than `limit_px` from where the true surface is seen, 1 or 0; NaN off the truth."""
+    """(n,) 1 for matches with an error above `limit_px` in the right image, otherwise 0; NaN where there is no truth."""
     x = truth(matches.u_left)
     off = np.linalg.norm(matches.u_right - rig.right.project(x), axis=1)
     return np.where(np.isfinite(off), off > limit_px, np.nan)
 
 
 def confidence_curves(matches: Matches, wrong: np.ndarray, kept: np.ndarray) -> dict[str, tuple[float, np.ndarray]]:
-    """For each confidence its AUC as a detector of wrong matches, and the wrong share of the surest `kept` (k,) ones.
+    """For each confidence: its AUC as a detector of wrong matches, and the wrong share of the most confident `kept` (k,).
 
-    `wrong` is (n,), NaN where nobody knows, as `wrong_matches` tells it.
+    `wrong` (n,) is the result of `wrong_matches`, NaN if unknown.
     """
     known = np.isfinite(wrong)
     bad = wrong[known] > 0
@@ -252,9 +253,9 @@ class RealPair:
     disparity_px: np.ndarray
 
     def wrong_matches(self, matches: Matches, *, limit_px: float = 2.0) -> np.ndarray:
-        """Which matches (n,) miss the disparity by more than `limit_px`, 1 or 0; NaN where it is not known.
+        """(n,) 1 for matches that differ from the disparity by more than `limit_px`, otherwise 0; NaN if it is unknown.
 
-        Where the disparity is known but the right camera is blocked every match counts as it is: wrong, as a rule.
+        If the disparity is known but the point is hidden from the right camera, its match counts, too, usually as wrong.
         """
         height, width = self.disparity_px.shape
         x, y = np.clip(np.rint(matches.u_left), 0, (width - 1, height - 1)).astype(int).T
@@ -262,7 +263,7 @@ class RealPair:
         return np.where(np.isfinite(off), off > limit_px, np.nan)
 
     def left_part(self, width_px: int, height_px: int) -> RealPair:
-        """The left part of this shape, as high as the photographs (or all, where they are narrower), at this size."""
+        """The left part of the photographs with this aspect ratio (all, if they are narrower), resized to this size."""
         width = min(round(self.left.shape[0] * width_px / height_px), self.left.shape[1])
         scale, size = width_px / width, (width_px, height_px)
         resample = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
@@ -275,7 +276,7 @@ class RealPair:
 
 
 def real_pair(folder: Path) -> RealPair:
-    """Read left.png, right.png, disparity.npz (x_right = x_left - disparity) and, where there is one, occlusion.png.
+    """Read left.png, right.png, disparity.npz (x_right = x_left - disparity) and, if there is one, occlusion.png.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Rendered calibration sweeps, correspondences from their labels, and calibrations judged against their truth."""
+"""Rendered calibration sweeps, correspondences from their labels, and calibrations compared with their truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lib.recordings import Recording
 from lib.simulator import Design, Microscope, simulate
 from notebooks.studies.cameras import rms
 
-#: Options of `calibrate` and whether the detector's covariances weigh the rows, for each way to calibrate from detections.
+#: Estimator -> the option `offsets` of `calibrate`, and whether the rows are weighted by the detector's covariances.
 ESTIMATORS = {
     "plain": (False, False),
     "covariances": (False, True),
@@ -81,12 +81,12 @@ class Judgement:
     Attributes
     ----------
     triangulation_um:
-        3D RMS of the detected landmarks triangulated, against where they were: detector and calibration.
+        3D RMS error of the triangulated detections: the error of detector and calibration.
     calibration_um, calibration_bound_um:
-        3D RMS of the true landmarks triangulated from their exact pixels: the calibration's own error; and its bound.
+        3D RMS error of the landmarks triangulated from exact pixels: the error of the calibration alone; and its bound.
     projection_px, projection_bound_px:
-        RMS distance in an image of the true landmarks' projections, over both images; and its bound.  It also shows
-        errors that both images have in common.
+        RMS error of the projections of the true landmarks in an image, over both images; and its bound.  It also shows
+        errors that are common to both images.
     sigma_u_px:
         RMS error of the used detections per coordinate, measured against truth: noise and bias.
     bias_px:
@@ -113,7 +113,7 @@ class Judgement:
 
 
 def exact_pixels(recording: Recording, rows: Correspondences) -> np.ndarray:
-    """(n, 4) exact pixels, left and right, of the landmarks and instants of `rows`.
+    """(n, 4) exact pixels, left and right, of the landmarks in `rows`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The detector's errors from frame to frame: it follows rendered tools at 25 frames a second."""
+"""The detector's errors from frame to frame, while it follows rendered tools at 25 frames a second."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from lib.landmarks.detector import TRACKED_FROM
 from lib.simulator import Eye, Microscope, Motion, Window, render_view
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 
-_SIDE_PX = 560  # of the rendered window around the tool: closeups see no more
-_LOST_PX = 60.0  # farther off, or less sure than `TRACKED_FROM`, the next frame is searched as a whole
+_SIDE_PX = 560  # side of the rendered window around the tool; closeups need no more
+_LOST_PX = 60.0  # a larger error, or a confidence below `TRACKED_FROM`, makes the detector search the whole next frame
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedErrors:
-    """What the detector got wrong, frame after frame.
+    """The detector's errors, frame by frame.
 
     Attributes
     ----------
     error, covariance:
-        (n, 3, 2, 2) px, detected less true, of landmark and view, NaN where it found nothing; and (n, 3, 2, 2, 2) as stated.
+        (n, 3, 2, 2) px, detected minus true, by landmark and view, NaN if missing; and the stated (n, 3, 2, 2, 2) px^2.
     scene, follows:
-        (n,) number of the eye and tool; and whether the next row is the next frame.
+        (n,) number of the eye and tool; and True if the next row is the next frame.
     """
 
     error: np.ndarray
@@ -38,7 +38,7 @@ class TrackedErrors:
     follows: np.ndarray
 
     def correlation(self, lag: int) -> float:
-        """Of a coordinate's error with that of the same landmark `lag` frames later, its scene's mean apart."""
+        """Correlation of a coordinate's error with the error `lag` frames later, after subtracting the mean of the scene."""
         e = np.clip(self.error, -5.0, 5.0)
         means = np.stack([np.nanmean(e[self.scene == k], axis=0) for k in np.unique(self.scene)])
         e = e - means[self.scene]
@@ -48,7 +48,7 @@ class TrackedErrors:
         return float(np.nanmean((e[:-lag] * e[lag:])[together]) / np.nanmean(e**2))
 
     def draw(self, n: int, rng: np.random.Generator, *, stretch: int = 50) -> np.ndarray:
-        """Rows for n frames of one scene: stretches of consecutive frames, `stretch` long on average."""
+        """Rows for n frames from one random scene: stretches of consecutive frames, `stretch` long on average."""
         mine = np.flatnonzero(self.scene == rng.integers(self.scene.max() + 1))
         rows = np.empty(n, int)
         for i in range(n):
@@ -65,9 +65,9 @@ def tracked_errors(
     Parameters
     ----------
     parts, frames:
-        Of each scene: parts of its motion, and frames of each.
+        Number of parts of each scene's motion, and of frames in each part.
     seed:
-        Of the first scene.  Every third scene shows a surgeon's motion, the others a sweep.
+        Seed of the first scene.  Every third scene shows a surgeon's motion, the others a sweep.
     detector:
         None = the one that ships.
     """
@@ -85,7 +85,7 @@ def tracked_errors(
 
 
 def _followed(detector: Detector, seed: int, parts: int, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """(error, covariance, whether the next frame follows) of each frame of a scene."""
+    """(error, covariance, True if another frame follows) of each frame of a scene."""
     kind, duration_s = ("surgeon", 18.0) if seed % 3 == 1 else ("sweep", 60.0)
     microscope, rng = Microscope(), np.random.default_rng([seed, 131])
     eye = Eye(seed=RESERVED_SEEDS[seed % len(RESERVED_SEEDS)])
@@ -108,7 +108,7 @@ def _followed(detector: Detector, seed: int, parts: int, frames: int) -> Iterato
             true, origin = np.array(true), np.array(origin)[:, None]
             lost = before is None or not (np.linalg.norm(before.u - origin - true, axis=2) < _LOST_PX).all()
             lost = lost or (before.confidence < TRACKED_FROM).any()
-            # The search of a whole frame stands in as the truth within a few pixels.
+            # The search of a whole frame is replaced by the truth plus an error of a few pixels.
             u = true + rng.normal(0, 3.0, true.shape) if lost else before.u - origin
             near = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
             found = detector.track(np.stack(images), near, min_confidence=0.0)

@@ -1,4 +1,4 @@
-"""What the studies of the detector's training share: simulated data, a small training, and its record."""
+"""Shared by the studies of the detector's training: its variants, a small configuration, test windows, recorded scores."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CURVE = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0
 
 
 def small_config(network: HourglassConfig, steps: int, seed: int) -> TrainingConfig:
-    """The same for all variants; rotation and zoom are drawn with the windows, as in the paper."""
+    """The configuration of all variants; rotation and zoom are drawn with the windows, as in the paper."""
     return replace(
         PRESETS["best"],
         network=network,
@@ -43,7 +43,7 @@ def small_config(network: HourglassConfig, steps: int, seed: int) -> TrainingCon
 
 
 def tool_windows(images: Sequence[LabelledImage], template: WindowSource) -> Samples:
-    """One window round the tool of each full-HD image, displaced, turned and zoomed at random as in training."""
+    """One window around the tool of each full-HD image, displaced, rotated and zoomed at random as in training."""
     whole = [labelled for labelled in images if np.isfinite(labelled.u).all()]
     height, width = whole[0].image.shape[:2]
     size = (width // TOOL_REDUCTION, height // TOOL_REDUCTION)
@@ -58,7 +58,7 @@ def tool_windows(images: Sequence[LabelledImage], template: WindowSource) -> Sam
 
 
 def record_scores(result: Evaluation) -> None:
-    """State the PCK curve and the scores of an evaluation."""
+    """Record the PCK curve and the scores of an evaluation."""
     for threshold, value in zip(CURVE, result.curve(np.array(CURVE)), strict=True):
         report.record(f"pck_{threshold:.3f}", value, "%")
     scores = result.scores

@@ -1,4 +1,4 @@
-"""A detector whose last stage is a network under study: windows round each landmark, at full resolution."""
+"""A detector whose last stage is the network under study, in windows around each landmark, at full resolution."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from lib.landmarks.windows import cut, tool_pose, window_from_image
 from lib.training.error_models import Seen, seen_by
 from lib.training.samples import LabelledImage
 
-#: Side of the windows.
+#: Side of the windows, in px.
 WINDOW_PX = 128
 
 
 @dataclass(frozen=True, eq=False)
 class WindowStage:
-    """Called as `Detector` is.
+    """A detector, called like `Detector`.
 
     Attributes
     ----------
     finder:
-        Finds the rough landmarks: the shipped stages before the last.
+        Finds the rough landmarks; the shipped stages before the last.
     network:
-        The windows' stage.
+        The stage that sees the windows.
     errors:
-        Its error model.
+        The error model of that stage.
     """
 
     finder: Detector
@@ -45,12 +45,12 @@ class WindowStage:
 
     @cached_property
     def last(self) -> Detector:
-        """The windows' error model under the name of the stage, for a detector that is given the peaks."""
+        """A detector with the error model of the windows; it gets the peaks of the network."""
         return Detector(self.finder.frame_network, error_models={"window": self.errors})
 
     @cached_property
     def _run(self) -> Callable[[Tensor], list[Tensor]]:
-        """The network as torch runs it best."""
+        """The network, prepared for fast inference in torch."""
         return accelerated(self.network, "torch")
 
     def __call__(self, images: ArrayLike) -> Landmarks:
@@ -60,7 +60,7 @@ class WindowStage:
         return self.last.refine(images, rough, "window", seen) if seen else rough.without_unsure()
 
     def stage_peaks(self, images: np.ndarray, u: np.ndarray) -> tuple[Peaks, np.ndarray, np.ndarray] | None:
-        """As `Detector.stage_peaks`, of the windows round rough landmarks u (n, 3, 2); None without any window."""
+        """Like `Detector.stage_peaks`, for windows around rough landmarks u (n, 3, 2); None if there is no window."""
         angle = tool_pose(u)[1]
         which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
         if not len(which):
@@ -74,7 +74,7 @@ class WindowStage:
         return decode(own, self.network.stride), matrices, which
 
     def fitted(self, images: Sequence[LabelledImage], rough: Landmarks) -> WindowStage:
-        """A copy whose error model is fitted on validation images, `rough` being the finder's landmarks in them."""
+        """A copy with its error model fitted to validation images; `rough` are the finder's landmarks in them."""
         parts = []
         for i, one in enumerate(images):
             if seen := self.stage_peaks(one.image[None], rough.u[i : i + 1]):

@@ -1,6 +1,6 @@
-"""Data of the studies that train on the reference rig: shards of frames, and upright windows cut from them.
+"""Data for studies that train on the reference rig: shards of frames, and upright windows cut from them.
 
-A shard keeps each frame at a fifth of its resolution and a crop round each landmark; validation shards keep the frames too.
+A shard has each frame at a fifth of its resolution and a crop around each landmark.  Validation shards also have the frames.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sa
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import packed, read_shards, square_round
 
-#: Of the stored frames.
+#: Factor by which the stored frames are reduced.
 STORED_REDUCTION = 5
-#: Reduction of the windows round the tool, and the landmark index that means the whole tool.
+#: Reduction of the windows around the tool, and the landmark index that means the whole tool.
 TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 CROP_PX = 288
 FRAMES = 16
@@ -31,7 +31,7 @@ _SEEDS = {"training": 0, "validation": 1}
 
 
 def simulated(shards: int, validation: int = 3) -> Path:
-    """The folder of the simulated frames, in which at least so many shards of 16 frames exist; missing ones are made."""
+    """The folder of the simulated frames, with at least these numbers of shards of 16 frames; missing shards are made."""
     folder = paths.CACHE / "landmarks"
     folder.mkdir(parents=True, exist_ok=True)
     for kind, n in (("training", shards), ("validation", validation)):
@@ -45,7 +45,7 @@ def simulated(shards: int, validation: int = 3) -> Path:
 
 
 def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
-    """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
+    """Write one shard from full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
     images, r = list(images), STORED_REDUCTION
     sizes = [(image.shape[1] // r, image.shape[0] // r) for _, image, *_ in images]
     frames = [cv2.resize(part.image, size, interpolation=cv2.INTER_AREA) for part, size in zip(images, sizes, strict=True)]
@@ -72,9 +72,9 @@ def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bo
 class WindowSource(Source):
     """Upright windows of `size` px, cut out of crops (n, h, w, 3) uint8 with their labels.
 
-    Each is cut round its `landmark` (n,), or, where that is `TOOL`, round the middle of the tool.  `shift_px` and `turn_rad`
-    are standard deviations of the error of place and direction; a tenth of the windows has three times as much.  `zoom` is
-    the range of magnification.
+    Each is cut around its `landmark` (n,) or, if that is `TOOL`, around the middle of the tool.  `shift_px` and `turn_rad`
+    are standard deviations of the error in position and direction, three times as large in a tenth of the windows.  `zoom`
+    is the range of magnification.
     """
 
     crops: np.ndarray
@@ -88,13 +88,13 @@ class WindowSource(Source):
 
     @classmethod
     def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
-        """From the (first) shards of a folder."""
+        """Windows around the landmarks, from the first `shards` of a folder; None = all."""
         names = "crops", "crop_u", "crop_visibility", "crop_landmark"
         return cls(*read_shards(folder, "validation" if validation else "training", names, shards))
 
     @classmethod
     def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
-        """Windows round the whole tool at `TOOL_REDUCTION`."""
+        """Windows around the whole tool at `TOOL_REDUCTION`."""
         kind = "validation" if validation else "training"
         frames, u, visibility = read_shards(folder, kind, ("frames", "u", "visibility"), shards)
         labels = cell_from_image(u, TOOL_REDUCTION), visibility, np.full(len(u), TOOL)
