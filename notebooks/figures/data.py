@@ -77,7 +77,7 @@ def rig_page(scene: Scene, microscope: Microscope, rig: StereoRig) -> Figure:
         xlim=(-9.6, 9.6), ylim=(3.2, -5.2), xlabel="x (mm)", ylabel="z (mm), into the eye",
         title="Section through the microscope's frame, y = 0",
     )  # fmt: skip
-    angle = np.deg2rad(np.linspace(2, 20, 60))
+    angle = np.deg2rad(np.linspace(2, 30, 80))
     um = 1e3 / (np.mean(microscope.pixels_per_mm) * np.sqrt(2) * np.sin(angle / 2))
     error.plot(np.rad2deg(angle), um, color=COLOURS["ours"])
     error.plot(

@@ -259,7 +259,7 @@ def engine_bars(table: Table) -> Figure:
     ax.margins(x=0.1)
     handles = [Patch(color=COLOURS["ours"], label="CPU time"), Patch(color=COLOURS["baseline"], label="wall time")]
     ax.legend(handles=handles, loc="lower right")
-    ax.set(xlabel="ms", title="Six windows of a stereo pair")
+    ax.set(xlabel="ms", title="Six windows: three in each image of a pair")
     return fig
 
 
