@@ -1,4 +1,4 @@
-"""Where the real data sets lie that notebooks and tests use.  They do not ship: `data/README.md` says where to get each."""
+"""Folders of the real data sets that notebooks and tests use.  They do not ship; `data/README.md` says where to get them."""
 
 import os
 from pathlib import Path
@@ -9,12 +9,12 @@ VARIABLE = "MICROSTEREO_DATA"
 
 
 def folder(name: str) -> Path | None:
-    """The folder of a data set, such as ``"fundus"``, in that which ``MICROSTEREO_DATA`` names; None where it is not."""
+    """The folder of a data set, such as ``"fundus"``, inside the folder ``MICROSTEREO_DATA``; None if there is none."""
     root = os.environ.get(VARIABLE)
     found = paths.ROOT / root / name if root else None
     return found if found and found.is_dir() else None
 
 
 def missing_line(name: str) -> str:
-    """The one line that is told when a data set is not at hand."""
-    return f"Skipped: the real data set '{name}' is not at hand; point {VARIABLE} at the folder that holds it."
+    """The line to print if a data set is missing."""
+    return f"Skipped: the real data set '{name}' is missing. Set {VARIABLE} to the folder that contains it."

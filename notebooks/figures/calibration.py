@@ -1,4 +1,4 @@
-"""Figures of notebook 03: calibration and how well it is known."""
+"""Figures of notebook 03: calibration and its uncertainty."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WHITE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 
 
 def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
-    """Robot positions (n, 3) in 3D and their detections in both images, coloured by depth along z of the robot."""
+    """Robot positions (n, 3) mm in 3D and their detections (n, 2) px in both images, coloured by the robot's height z."""
     page = plt.figure(figsize=(12, 6.0), layout="constrained")
     grid = page.add_gridspec(2, 2, width_ratios=(1.35, 1))
     axes = page.add_subplot(grid[:, 0], projection="3d")
@@ -32,20 +32,20 @@ def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, s
     look = {"c": heights, "s": 12, "cmap": "plasma", "vmax": heights.max() + 0.2 * np.ptp(heights)}  # no pale yellow
     axes.scatter(*x_mm.T, **look)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
-    axes.set_title("Robot: where the landmarks were", loc="left")
+    axes.set_title("Robot: positions of the landmarks", loc="left")
     axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=0.95)
     axes.locator_params(nbins=4)
     for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
         flat = page.add_subplot(grid[i, 1])
         dots = flat.scatter(*u.T, **look)
         flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)" if i else "", ylabel="y (px)")
-        flat.set_title(f"{side} image: where they were seen")
+        flat.set_title(f"{side} image: detections")
     page.colorbar(dots, ax=page.axes, label="height z (mm)", shrink=0.7)
     return page
 
 
 def _plain_log(axis: Axis, ticks: Sequence[float] | None = None) -> None:
-    """Plain numbers on a logarithmic axis: 1, 2, 5 and their decades, or `ticks`."""
+    """Sets the ticks of a logarithmic axis to `ticks`, or to 1, 2, 5 times powers of ten, labelled without exponents."""
     axis.set_major_locator(FixedLocator(ticks) if ticks is not None else LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -69,7 +69,7 @@ def noise_errors(table: Table) -> Figure:
 
 
 def when_affine_wins(table: Table) -> Figure:
-    """Recorded error of perspective DLT over the affine one's, by four measures, against the number of correspondences."""
+    """Recorded ratios of the perspective DLT's error to the affine one, by four measures, against the number of rows."""
     measures = {
         "reprojection": "Reprojection, held out",
         "exact_pixels": "Triangulation, held-out exact pixels",
@@ -92,18 +92,18 @@ def when_affine_wins(table: Table) -> Figure:
 
 
 def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
-    """Focal lengths that a perspective decomposition returns for a far camera."""
+    """Histogram of the focal lengths that a perspective decomposition gives for a far camera."""
     page, ax = figure(width_in=8, height_in=3.0)
     bins = np.geomspace(found_px.min() * 0.8, true_px * 1.5, 40)
     ax.hist(found_px, bins=bins, color=COLOURS["paper"], label="perspective DLT, decomposed")
     ax.axvline(true_px, color=COLOURS["truth"], linewidth=2.5, label="true focal length")
-    ax.set(xscale="log", xlabel="focal length (px)", ylabel="runs", title="A far camera's focal length is noise")
+    ax.set(xscale="log", xlabel="focal length (px)", ylabel="runs", title="A far camera's focal length is not determined")
     page.legend(loc="outside lower center", ncols=2)
     return page
 
 
 def shallow_bias(table: Table) -> Figure:
-    """Recorded estimated over true depth column against the depth covered by the tool."""
+    """Recorded depth scale of the cameras, estimated over true, against the depth that the tool covers."""
     page, ax = figure(width_in=8.5, height_in=3.8)
     styles = {
         "dlt": ("DLT", "baseline", "s-"),
@@ -120,7 +120,7 @@ def shallow_bias(table: Table) -> Figure:
         xlabel="half depth covered by the tool (mm)",
         ylabel="depth scale found / true",
         ylim=(0.7, 1.6),
-        title="Weights matter where the sweep is shallow",
+        title="Weights matter if the sweep is shallow",
     )
     _plain_log(ax.xaxis, c["half_depth_mm"])
     ax.legend(ncols=2)
@@ -128,7 +128,7 @@ def shallow_bias(table: Table) -> Figure:
 
 
 def ladder_table(comparison: Comparison, caption: str) -> HTML:
-    """The models of a ladder: parameters, chi-square, BIC above the best one's, p-value of the constraint."""
+    """The compared models: number of parameters, chi-square, BIC less the best one, p-value of the constraint."""
     rows = [
         [rung.model + (", chosen" if rung is comparison.best else ""), rung.parameters, f"{rung.chi_square:.1f}",
          f"{rung.bic - comparison.best.bic:.1f}", "" if rung.against is None else f"{rung.p_value:.2g}"]
@@ -138,7 +138,7 @@ def ladder_table(comparison: Comparison, caption: str) -> HTML:
 
 
 def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
-    """BIC above the best model's, a panel a data set."""
+    """BIC of each model less that of the best one, one panel for each data set."""
     page, axes = figure(1, len(comparisons), width_in=12, height_in=3.8, sharey=True, squeeze=False)
     most = max(rung.bic - comparison.best.bic for comparison in comparisons.values() for rung in comparison.rungs)
     for ax, (title, comparison) in zip(axes[0], comparisons.items(), strict=True):
@@ -160,7 +160,7 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
 
 
 def ellipsoids(calibration: Calibration, x_mm: np.ndarray) -> Figure:
-    """Uncertainty ellipsoids of triangulated points (n, 3), with and without the noise of their own detection, enlarged."""
+    """Enlarged uncertainty ellipsoids of triangulated points (n, 3) mm, with and without the noise of their detections."""
     page, _ = figure(1, 2, width_in=12, height_in=4.6)
     page.clear()
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
@@ -188,9 +188,9 @@ def advice_view(
     calibration: Calibration, robot_from_microscope: RigidTransform, half_size_mm: np.ndarray, advised_mm: np.ndarray,
     scale_um: tuple[float, float],
 ) -> Figure:  # fmt: skip
-    """Depth sd from calibration over the focal plane, the correspondences used, and the advised position (3,).
+    """Depth sd caused by the calibration on the focal plane, the correspondences used, and the advised position (3,) mm.
 
-    All positions of a slider have one colour scale, from `scale_um[0]` to `scale_um[1]`, so that pictures can be compared.
+    The colour scale, from `scale_um[0]` to `scale_um[1]`, is the same for all positions of a slider.
     """
     page, ax = figure(width_in=8.5, height_in=4.4)
     x, y = np.meshgrid(*(np.linspace(-h, h, 41) for h in half_size_mm[:2]))
@@ -202,7 +202,7 @@ def advice_view(
     used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
     style = {"markeredgecolor": "black", "clip_on": False}
     ax.plot(*used[:, :2].T, "o", color="white", markersize=4, label="correspondences", **style)
-    ax.plot(*advised[:, :2].T, "*", color=COLOURS["warning"], markersize=18, label="go here next", **style)
+    ax.plot(*advised[:, :2].T, "*", color=COLOURS["warning"], markersize=18, label="next position", **style)
     _plain_log(page.colorbar(image, ax=ax, label="depth sd from calibration (um)").ax.yaxis)
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
     ax.set_title(f"{len(used)} correspondences: {depth.mean():.0f} um mean, {depth.max():.0f} um worst", pad=14)
@@ -219,9 +219,9 @@ def advice_curves(table: Table, first: int) -> Figure:
         ax.plot(c["added"], c[f"{name}_sd"], "o-", markersize=3, color=COLOURS[colour], label=name)
     ax.set(
         xlabel=f"positions added to {first} clustered ones",
-        ylabel="calibration sd / sd of a row",
+        ylabel="sd of the calibration / sd of a row",
         yscale="log",
-        title="Where the tool goes matters more than how often",
+        title="The choice of positions matters more than their number",
     )
     _plain_log(ax.yaxis)
     ax.legend()
@@ -229,11 +229,11 @@ def advice_curves(table: Table, first: int) -> Figure:
 
 
 def residuals(calibration: Calibration) -> Figure:
-    """Residual arrows over each image, and their distribution beside the Gaussian of the same width."""
+    """Residuals as arrows over each image, and their histogram with a Gaussian of the same standard deviation."""
     c = len(calibration.cameras)
     page, axes = figure(1, c + 1, width_in=13, height_in=3.6)
     kept = []
-    # As large as they can be drawn apart: nine in ten arrows are shorter than a seventh of what the landmarks cover.
+    # Enlarge the arrows as far as nine in ten are shorter than a seventh of the extent of the landmarks.
     longest = np.nanquantile(np.abs(calibration.residuals_px), 0.9)
     span_px = np.nanmax(np.nanmax(calibration.y_px, axis=0) - np.nanmin(calibration.y_px, axis=0))
     times = next((n for n in (25, 10, 5, 2) if 7 * n * longest < span_px), 1)
@@ -257,13 +257,13 @@ def residuals(calibration: Calibration) -> Figure:
         color=COLOURS["ours"],
         label="Gaussian",
     )
-    axes[-1].set(xlabel="px", title=f"{r.std():.2f} px a coordinate", yticks=[])
+    axes[-1].set(xlabel="px", title=f"{r.std():.2f} px per coordinate", yticks=[])
     axes[-1].legend()
     return page
 
 
 def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarray, title: str) -> Figure:
-    """One frame: detections (3, 2) and where the calibrated camera puts the robot's landmarks, with a magnified view."""
+    """One frame: detections (3, 2) px and projections (3, 2) px of the robot's landmarks, with a magnified view."""
     page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.6, 1])
     middle = np.nanmean(detected, axis=0)
     half = max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0))))
@@ -281,7 +281,7 @@ def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarr
 
 
 def working_distance(table: Table) -> Figure:
-    """Recorded 3D error of the affine and the near-affine model against working distance."""
+    """Recorded 3D error of the affine and the near-affine model against the working distance."""
     page, ax = figure(width_in=8, height_in=3.6)
     c = table.columns
     labels = [f"{1e3 / inverse:.0f}" if inverse else "affine" for inverse in c["inverse_distance_per_m"]]
@@ -297,14 +297,14 @@ def working_distance(table: Table) -> Figure:
         xlabel="working distance (mm)",
         ylabel="held-out 3D RMS (um)",
         ylim=(0, 1.25 * top.max()),
-        title="One parameter removes the error of the model",
+        title="One more parameter removes the error of the affine model",
     )
     ax.legend()
     return page
 
 
 def time_offset(found: TimeOffset, true_s: float) -> Figure:
-    """Reprojection error against the assumed clock offset, the estimate and the truth."""
+    """Reprojection error against the assumed clock offset, with the estimated and the true offset."""
     page, ax = figure(width_in=8, height_in=3.2)
     ax.plot(1e3 * found.trial_s, found.trial_rms_px, color=COLOURS["baseline"])
     middle, sd = 1e3 * found.offset_s, 1e3 * found.sd_s
@@ -319,14 +319,14 @@ def time_offset(found: TimeOffset, true_s: float) -> Figure:
     ax.set(
         xlabel="assumed offset between the clocks (ms)",
         ylabel="reprojection RMS (px)",
-        title="The clocks reveal themselves",
+        title="The error is smallest at the right clock offset",
     )
     ax.legend(loc="lower left")
     return page
 
 
 def checkerboards(table: Table, paper_um: float = 25.479) -> Figure:
-    """Recorded errors of reconstructed checkerboards, a panel a kind of optics, root mean squares over the sweeps."""
+    """Recorded errors of reconstructed checkerboards, RMS over the sweeps, one panel for each working distance."""
     optics = {
         inverse: table.where(inverse_distance_per_m=inverse)
         for inverse in sorted(set(table.columns["inverse_distance_per_m"]))
@@ -356,13 +356,13 @@ def checkerboards(table: Table, paper_um: float = 25.479) -> Figure:
 
 
 def root_mean_square(values: np.ndarray) -> float:
-    """Root mean square of what is finite."""
+    """Root mean square of the finite values."""
     values = np.asarray(values, dtype=np.float64)
     return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
 
 
 def estimators(chosen: Table, fresh: Table) -> Figure:
-    """Recorded error over its bound, an estimator a group: on the sweeps that chose the estimator and on fresh ones."""
+    """Recorded errors of each estimator over their bounds, on the sweeps used for the choice and on fresh ones."""
     page, axes = figure(1, 2, width_in=13, height_in=3.8, sharey=True)
     names = [
         key.removesuffix("_projection_over_bound") for key in chosen.columns if key.endswith("_projection_over_bound")
@@ -373,7 +373,7 @@ def estimators(chosen: Table, fresh: Table) -> Figure:
         (axes[1], "projection_over_bound", "Projection error"),
     ):
         for table, offset, colour, name in (
-            (chosen, -0.2, "baseline", "sweeps that chose"),
+            (chosen, -0.2, "baseline", "sweeps of the choice"),
             (fresh, 0.2, "ours", "fresh sweeps"),
         ):
             columns = [table.columns[f"{n}_{key}"] for n in names]
@@ -392,7 +392,7 @@ def estimators(chosen: Table, fresh: Table) -> Figure:
 
 
 def coverage(table: Table) -> Figure:
-    """Recorded repetitions: share of errors inside the reported 95 % region, and rejections of true constraints."""
+    """Recorded shares of errors inside the reported 95 % region, and of true constraints that are rejected."""
     page, axes = figure(1, 2, width_in=11, height_in=3.2)
     c = table.columns
     axes[0].plot(c["n_rows"], c["coverage_95_percent"], "o-", color=COLOURS["ours"])
@@ -414,13 +414,13 @@ def coverage(table: Table) -> Figure:
 
 
 def resolutions(table: Table) -> Figure:
-    """The paper's figure, recorded: errors of calibrations from labels and from detectors at four resolutions."""
+    """Recorded errors of calibrations from labels and from detectors at four resolutions, as in the paper's figure."""
     page, axes = figure(1, 3, width_in=14, height_in=3.8)
     groups = {name: table.where(detector=name).columns for name in dict.fromkeys(table.columns["detector"])}
     names = [f"{name}\n{root_mean_square(c['sigma_u_px']):.1f} px" for name, c in groups.items()]
     at = np.arange(len(names))
     for ax, key, unit, title in (
-        (axes[0], "detections_um", "um", "Detections triangulated (the paper's)"),
+        (axes[0], "detections_um", "um", "Detections triangulated (the paper's measure)"),
         (axes[1], "um", "um", "Exact pixels triangulated"),
         (axes[2], "projection_px", "px", "Projections"),
     ):
@@ -434,13 +434,13 @@ def resolutions(table: Table) -> Figure:
         ax.grid(axis="x", visible=False)
         ax.margins(y=0.2)
         _plain_log(ax.yaxis)
-    axes[1].set_xlabel("what was calibrated from, and its error a coordinate")
+    axes[1].set_xlabel("data of the calibration, and their RMS error per coordinate")
     axes[0].legend(fontsize=8)
     return page
 
 
 def offsets(names: Sequence[str], found: LandmarkOffsets, *, unit_um: float = 1e3) -> Figure:
-    """Where the landmarks are seen, in the tool's axes, with two standard deviations."""
+    """Offsets of the detected from the reported landmarks in the tool's axes, with two standard deviations."""
     page, ax = figure(width_in=8.5, height_in=3.4)
     at = np.arange(3)
     for k, name in enumerate(names):
@@ -461,7 +461,7 @@ def offsets(names: Sequence[str], found: LandmarkOffsets, *, unit_um: float = 1e
 
 
 def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Sequence[SphereFit]]) -> Figure:
-    """Frames of the real robot with the spheres found, and leave-one-out residuals (40 times) of two models."""
+    """Frames of the real robot with the spheres found, and leave-one-out residuals of two models, enlarged 40 times."""
     page, axes = figure(1, len(rows), width_in=13, height_in=3.6)
     colours = dict(zip(fits, (COLOURS["warning"], COLOURS["ours"]), strict=True))
     for ax, row in zip(axes, rows, strict=True):
@@ -484,13 +484,13 @@ def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Se
 
 
 def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: np.ndarray) -> Figure:
-    """The seven eigenvalues of Eq. (3), and the errors of the entries of A (4, 3) of some stacked cameras (4, 4)."""
+    """The seven eigenvalues of Eq. (3), and the errors of the entries of A (4, 3) for stacked cameras (4, 4)."""
     page, (left, right) = figure(1, 2, width_in=11, height_in=3.4)
     order = np.arange(1, 8)
     colours = [COLOURS["baseline"]] * 4 + [COLOURS["ours"]] * 3
     left.bar(order, values, color=colours)
     left.set(yscale="log", xlabel="eigenvalue", ylabel="squared standard deviations")
-    left.set_title("Four of noise, three of motion")
+    left.set_title("Four from noise, three from motion")
     left.set_xticks(order)
     for shift, (name, matrix), colour in zip((-0.2, 0.2), cameras.items(), ("paper", "ours"), strict=True):
         right.bar(np.arange(12) + shift, (matrix - true)[:, :3].ravel(), 0.4, color=COLOURS[colour], label=name)
@@ -498,25 +498,25 @@ def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: n
     for border in (2.5, 5.5, 8.5):
         right.axvline(border, color="#cccccc", linewidth=0.8)
     right.axhline(0, color="black", linewidth=0.8)
-    right.set(ylabel="found less true (px/mm)", title="Errors of A, three entries a pixel coordinate")
+    right.set(ylabel="estimated less true (px/mm)", title="Errors of A, three entries per pixel coordinate")
     right.legend(loc="best", fontsize=9)
     return page
 
 
 def residual_field(u: np.ndarray, residual_px: np.ndarray, title: str) -> Figure:
-    """Residuals (n, 2) at pixels (n, 2) as arrows, stretched to be seen; the title gives their size.
+    """Residuals (n, 2) px at pixels (n, 2) as enlarged arrows; the title gives their largest length and the enlargement.
 
-    Points at several depths share a line of sight: one is drawn outwards, another inwards.
+    Points at several depths lie on about the same ray; some of their residuals point outwards, others inwards.
     """
     page, ax = figure(width_in=9, height_in=5.4)
     largest = float(np.linalg.norm(residual_px, axis=1).max())
     scale = 80.0 / max(largest, 1e-9)
     ax.quiver(*u.T, *(scale * residual_px.T), color=COLOURS["paper"], angles="xy", scale_units="xy", scale=1, width=0.002)
     ax.plot(*u.T, ".", color=COLOURS["ours"], markersize=3)
-    ax.plot([], [], ".", color=COLOURS["ours"], label="points, several depths above each other")
-    ax.plot([], [], "-", color=COLOURS["paper"], label="what is left of each")
+    ax.plot([], [], ".", color=COLOURS["ours"], label="points, several depths on each ray")
+    ax.plot([], [], "-", color=COLOURS["paper"], label="residuals, enlarged")
     ax.set(aspect="equal", xlabel="x (px)", ylabel="y (px)")
     page.legend(loc="outside lower center", ncols=2)
-    ax.set_title(f"{title}: up to {largest:.2f} px left, arrows x {scale:.3g}")
+    ax.set_title(f"{title}: residuals up to {largest:.2f} px, enlarged {scale:.3g} times")
     ax.invert_yaxis()
     return page

@@ -40,7 +40,7 @@ _ERROR = "magma"
 
 
 def stereo_pair(left: np.ndarray, right: np.ndarray, u_tool: tuple[np.ndarray, np.ndarray]) -> Figure:
-    """The pair, with the landmarks of the tool, (3, 2) px each, NaN = missing."""
+    """The stereo pair with the landmarks of the tool, (3, 2) px in each image, NaN = missing."""
     page, axes = figure(1, 2, width_in=13, height_in=3.9)
     for ax, image, u, side in zip(axes, (left, right), u_tool, ("Left", "Right"), strict=True):
         show_image(ax, image, side)
@@ -51,7 +51,7 @@ def stereo_pair(left: np.ndarray, right: np.ndarray, u_tool: tuple[np.ndarray, n
 
 
 def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
-    """An image and the pixel descriptor of DeepMatching on it, channels (h, w, c): one panel a gradient direction."""
+    """An image and its pixel descriptors (h, w, c) of DeepMatching, one panel for each gradient direction."""
     page, axes = figure(3, 3, width_in=11, height_in=6.9)
     limit = float(np.quantile(channels[..., :8], 0.999))
     where = ("upper left", "top", "upper right", "left", "right", "lower left", "bottom", "lower right")
@@ -65,9 +65,9 @@ def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
 
 @dataclass(frozen=True, eq=False)
 class ResponseMap:
-    """How well one patch of the left image fits everywhere in the right one, at one level of the pyramid.
+    """Response of one patch of the left image at all places of the right one, at one level of the pyramid.
 
-    `centre_px` (2,) and `size_px` of the left patch; `response` (h, w), whose [y, x] stands for the right pixel
+    `centre_px` (2,) and `size_px` describe the left patch.  `response` (h, w) at [y, x] belongs to the right pixel
     (x, y) * stride_px - 1/2.
     """
 
@@ -84,7 +84,7 @@ class ResponseMap:
 
     @property
     def extent_px(self) -> tuple[float, float, float, float]:
-        """(left, right, bottom, top) for imshow over the right image."""
+        """(left, right, bottom, top) px of the map in the right image, for imshow."""
         height, width = self.response.shape
         half = self.stride_px / 2
         return (-0.5 - half, width * self.stride_px - 0.5 - half, height * self.stride_px - 0.5 - half, -0.5 - half)
@@ -93,10 +93,10 @@ class ResponseMap:
 def response_map(
     responses: torch.Tensor, level: int, u_left: np.ndarray, *, cell_px: int = 2, stride_px: int | None = None
 ) -> ResponseMap:
-    """The map of the patch nearest to the left pixel u_left (2,), of the responses (gy, gx, h, w) of one level.
+    """The response map of the patch nearest to the left pixel u_left (2,), from the responses (gy, gx, h, w) of one level.
 
-    `stride_px` is the distance of neighbouring places; None is that of an unpooled map.  Atomic patches tile the image; the
-    centres of the larger ones lie on the corners of the atomic patches.
+    `stride_px` is the distance of neighbouring places; None means that of an unpooled map.  Atomic patches tile the image.
+    The centres of larger patches lie on the corners of atomic ones.
     """
     width = PATCH * cell_px
     at = (u_left + 0.5) / width - (0.5 if level == 0 else 0.0)
@@ -106,7 +106,7 @@ def response_map(
 
 
 def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:
-    """One patch of the left image at growing sizes, and below each how well it fits everywhere in the right image."""
+    """One patch of the left image at growing sizes, and below each its response at all places of the right image."""
     page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.4)
     for (top, bottom), level in zip(axes.T, maps, strict=True):
         show_image(top, left, f"{level.size_px} px patch")
@@ -116,7 +116,7 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
             top.add_patch(box)
         show_image(bottom, np.full_like(right, 255))
         x0, x1, y1, y0 = level.extent_px
-        # Contrast by rank within the map: the background of a flat correlation is high, the peak is what counts.
+        # Subtract the median: the background of a correlation map is high, and the peak matters.
         shown = np.clip((level.response - np.median(level.response)) / np.ptp(level.response), 0, 1)
         bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="magma_r", norm=PowerNorm(0.8))
         rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
@@ -127,7 +127,7 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
 
 
 def neighbourhood(left: np.ndarray, right: np.ndarray, alone: ResponseMap, judged: ResponseMap) -> Figure:
-    """Left: a patch; then the right image with the places that fit it, alone and judged with its neighbourhood."""
+    """A patch of the left image, and the places in the right one that fit it alone and with its neighbourhood."""
     page, axes = figure(1, 3, width_in=11, height_in=2.9)
     show_image(axes[0], left, f"Left: one {alone.size_px} px patch")
     corner = alone.centre_px - alone.size_px / 2
@@ -147,7 +147,7 @@ def neighbourhood(left: np.ndarray, right: np.ndarray, alone: ResponseMap, judge
 
 
 def match_fields(left: np.ndarray, fields: dict[str, Matches], *, direction: np.ndarray | None = None) -> Figure:
-    """Matches on the left image, coloured by their displacement along `direction` (2,); None is the image's x."""
+    """Matches on the left image, coloured by their displacement along `direction` (2,); None means the x axis."""
     direction = np.array([1.0, 0.0]) if direction is None else direction
     shifts = {name: (m.u_right - m.u_left) @ direction for name, m in fields.items()}
     low, high = np.percentile(np.concatenate(list(shifts.values())), (3, 97))
@@ -163,11 +163,11 @@ def match_fields(left: np.ndarray, fields: dict[str, Matches], *, direction: np.
 def epipolar_geometry(
     left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, kept: np.ndarray
 ) -> Figure:
-    """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches, kept or not."""
+    """Left points (k, 2) px, their epipolar lines in the right image; distances (n,) px of matches, `kept` (n,) or not."""
     height, width = right.shape[:2]
     page = plt.figure(figsize=(12, 6.6 * height / width + 2.9), layout="constrained")
     panels = page.subplot_mosaic([["left", "right"], ["filter", "filter"]], height_ratios=(6 * height / width, 2.4))
-    for name, image, title in (("left", left, "Left: points"), ("right", right, "Right: their lines are parallel")):
+    for name, image, title in (("left", left, "Left: points"), ("right", right, "Right: their epipolar lines are parallel")):
         show_image(panels[name], image, title)
         panels[name].set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
     dark = {"facecolor": "black", "alpha": 0.55, "edgecolor": "none", "pad": 1.5}
@@ -177,7 +177,7 @@ def epipolar_geometry(
         a, b, c = rig.fundamental @ [*point, 1.0]
         x = np.array([0.0, width - 1.0])
         panels["right"].plot(x, -(a * x + c) / b, color=colour, lw=1.6)
-        beside = (point[0], -(a * point[0] + c) / b)  # in its own column: at the border numbers would overlap
+        beside = (point[0], -(a * point[0] + c) / b)  # not at the border, where the numbers would overlap
         for side, place, apart in (("left", point, (6, 4)), ("right", beside, (0, 3))):
             panels[side].annotate(f"{k + 1}", place, apart, textcoords="offset points", color=colour, fontsize=9, bbox=dark)
     span = float(np.abs(distance_px).max()) + 1e-6
@@ -186,15 +186,16 @@ def epipolar_geometry(
         bins=np.linspace(-span, span, 82),
         stacked=True,
         color=[COLOURS["ours"], COLOURS["warning"]],
-        label=[f"kept: {kept.mean():.0%}", "dropped: beyond two of their own sigmas"],
+        label=[f"kept: {kept.mean():.0%}", "dropped: beyond two of their standard deviations"],
     )
-    panels["filter"].set(xlabel="distance of a match from its line (px)", ylabel="matches", title="The filter", yscale="log")
+    panels["filter"].set(xlabel="distance of a match from its line (px)", ylabel="matches", yscale="log")
+    panels["filter"].set_title("Epipolar filter")
     panels["filter"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=9)
     return page
 
 
 def point_errors(errors_mm: dict[str, np.ndarray], sigma_um: dict[str, float]) -> Figure:
-    """Histograms of the errors of triangulated points along named directions, and their predicted sigma (um)."""
+    """Histograms of the errors of triangulated points along named directions, and the predicted standard deviations."""
     page, axes = figure(1, len(errors_mm), width_in=5.2 * len(errors_mm), height_in=3.0)
     for ax, (name, error) in zip(axes, errors_mm.items(), strict=True):
         error = error[np.isfinite(error)] * 1000
@@ -219,10 +220,10 @@ def profiles(
     *,
     title: str = "",
 ) -> Figure:
-    """A section against a reference: points near it, and curves (um beyond the reference, colour) by name."""
+    """A section relative to a reference: points near it, and named curves (um behind the reference, colour)."""
     page, ax = figure(width_in=9, height_in=3.6)
     _section(ax, position_mm, points, curves)
-    ax.set(ylabel="beyond the reference (um)", title=title)
+    ax.set(ylabel="depth behind the reference (um)", title=title)
     page.legend(loc="outside lower center", fontsize=9, ncols=4)
     return page
 
@@ -239,7 +240,7 @@ def _section(
     ax.plot(x, np.where((beyond >= near) & (beyond <= far), beyond, np.nan), ".", color=COLOURS["baseline"], markersize=3,
             alpha=0.6, label="triangulated points")  # fmt: skip
     for outside, border, marker in ((beyond < near, near, "^"), (beyond > far, far, "v")):
-        label = "points beyond the figure" if marker == "^" or not (beyond < near).any() else None
+        label = "points outside the figure" if marker == "^" or not (beyond < near).any() else None
         if outside.any():
             ax.plot(x[outside], np.full(outside.sum(), border), marker, color=COLOURS["baseline"], markersize=4,
                     alpha=0.6, clip_on=False, label=label)  # fmt: skip
@@ -249,13 +250,13 @@ def _section(
 def held_out_curve(
     held_out: np.ndarray, chosen: float, smoothness: np.ndarray | None = None, error_um: np.ndarray | None = None
 ) -> Figure:
-    """Held-out error of candidates (m, 2), in percent above the least; the choice; the true error where it is known."""
+    """Held-out errors of the candidates (m, 2) in percent above the smallest, the choice, and the true errors if known."""
     page, ax = figure(width_in=7, height_in=3.4)
     excess = (held_out[:, 1] / held_out[:, 1].min() - 1) * 100
     side = "" if error_um is None else " (left axis)"
     ax.plot(held_out[:, 0], excess, "o-", color=COLOURS["ours"], label=f"held-out error{side}")
     ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
-    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the least (%)")
+    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the smallest (%)")
     ax.set_yscale("symlog", linthresh=0.1)
     ax.set_ylim(-0.02, 3 * excess.max() + 0.1)
     ax.yaxis.set_major_formatter("{x:g}")
@@ -282,13 +283,13 @@ def smoothness_slider(
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> VBox:
-    """A slider over sections of surfaces of growing smoothness."""
+    """A slider over sections through surfaces of increasing smoothness."""
 
     def draw(mu: int) -> Figure:
-        """A section through the surface at one smoothness, beside the points."""
+        """A section through the surface at one smoothness, with the points."""
         page, ax = figure(width_in=11, height_in=3.4)
         _relative_section(ax, mu, depths_mm, position_mm, points, reference)
-        ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth beyond a smooth bowl (um)")
+        ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth behind a smooth bowl (um)")
         ax.legend(loc="upper right", fontsize=8, ncols=3)
         return page
 
@@ -303,12 +304,12 @@ def smoothness_sections(
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> Figure:
-    """Sections of three of the surfaces: too rough, in the middle, too smooth."""
+    """Sections through three of the surfaces: the roughest, the middle one, the smoothest."""
     page, axes = figure(1, 3, width_in=14, height_in=3.4, sharey=True)
     for ax, step in zip(axes, (0, len(smoothness) // 2, -1), strict=True):
         _relative_section(ax, step, depths_mm, position_mm, points, reference)
         ax.set_title(f"mu = {smoothness[step]:.2g} px²/mm")
-    axes[0].set_ylabel("depth beyond a smooth bowl (um)")
+    axes[0].set_ylabel("depth behind a smooth bowl (um)")
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=3)
     return page
 
@@ -322,7 +323,7 @@ def _relative_section(
     reference: dict[str, tuple[np.ndarray, str]],
     limit_um: float = 120.0,
 ) -> None:
-    """A section less a polynomial through the middle one of the surfaces: a bowl of millimetres hides micrometres."""
+    """A section less a polynomial fitted to the middle surface, since a bowl of millimetres would hide micrometres."""
     bowl = np.polynomial.Polynomial.fit(position_mm, depths_mm[len(depths_mm) // 2], 6)
     apart = 1e3 * (points[1] - bowl(points[0]))
     ax.plot(points[0], apart, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
@@ -335,7 +336,7 @@ def _relative_section(
 def score_table(
     scores: dict[str, dict[str, tuple[Matches, DisparityScore, float]]], caption: str
 ) -> HTML:
-    """Matchers on real pairs: matches, median error, share above 1 and 2 px, seconds."""
+    """Matchers on real pairs: number of matches, median error, shares of errors above 1 and 2 px, seconds."""
     header = ["pair", "method", "matches", "median (px)", "> 1 px", "> 2 px", "seconds"]
     rows = [
         [pair, method, f"{len(m)}", f"{s.median_px:.3f}", f"{s.above_1:.1%}", f"{s.above_2:.1%}", f"{seconds:.2f}"]
@@ -346,7 +347,7 @@ def score_table(
 
 
 def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
-    """Maps (h, w) of an error over the image, NaN where there is none, one colour scale."""
+    """Maps (h, w) of errors over the image, NaN where unknown, on the same colour scale."""
     if limit_um is None:
         limit_um = float(np.nanpercentile(np.abs(np.concatenate([m.ravel() for m in maps_um.values()])), 98))
     page, axes = figure(1, len(maps_um), width_in=4.6 * len(maps_um), height_in=2.9, squeeze=False)
@@ -360,7 +361,7 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
 
 
 def predicted_error(sigma_um: np.ndarray, error_um: np.ndarray | None = None) -> Figure:
-    """Map (h, w) of the predicted standard deviation of the depth; and the RMS of the true error where it says so much."""
+    """Map (h, w) of the predicted standard deviation of the depth, and the RMS of the true errors against it."""
     page, axes = figure(1, 2 if error_um is not None else 1, width_in=10, height_in=3.4, squeeze=False)
     show_image(axes[0, 0], sigma_um, "Predicted standard deviation (um)")
     axes[0, 0].images[0].set(cmap=_ERROR, clim=(0, float(np.nanpercentile(sigma_um, 99))))
@@ -376,13 +377,13 @@ def predicted_error(sigma_um: np.ndarray, error_um: np.ndarray | None = None) ->
     end = 1.1 * max(*x, *rms)
     axes[0, 1].plot([0, end], [0, end], color=COLOURS["baseline"], ls="--", label="as predicted")
     axes[0, 1].set(xlabel="predicted standard deviation (um)", ylabel="true depth error, RMS (um)", xlim=(0, 1.1 * max(x)))
-    axes[0, 1].set(title="Does it come true?", ylim=(0, end))
+    axes[0, 1].set(title="Predicted and true error", ylim=(0, end))
     axes[0, 1].legend(fontsize=9)
     return page
 
 
 def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray, *, zoom: float = 1.12) -> Axes:
-    """A still of the surface (h, w, 3) mm with the image (h, w, 3) as its skin, on a 3D axes; depth drawn twofold."""
+    """Draw the surface (h, w, 3) mm, textured with the image (h, w, 3), on 3D axes; depth is enlarged twice."""
     light = LightSource(azdeg=300, altdeg=50)
     x, y, z = np.moveaxis(surface_mm, 2, 0)
     shade = light.hillshade(np.nan_to_num(-z, nan=np.nanmean(-z)), vert_exag=3)[..., None]
@@ -401,15 +402,15 @@ def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray, *, zoom: f
 def reconstruction(
     image: np.ndarray, surface: BSplineSurface, rig: StereoRig, *, mask: np.ndarray | None = None
 ) -> Figure:
-    """The left image with iso-depth lines beside a still of the surface seen obliquely.
+    """The left image with lines of equal depth, and an oblique view of the surface.
 
-    `mask` (h, w), True = no surface there.
+    The surface is not drawn where `mask` (h, w) is True.
     """
     page = plt.figure(figsize=(14, 4.4), layout="constrained")
     left, right = page.add_subplot(1, 2, 1), page.add_subplot(1, 2, 2, projection="3d")
     step_mm = _surface_views(left, right, image, surface, rig, mask)
     left.set_title(f"Lines of equal depth, every {step_mm:g} mm")
-    right.set_title("The surface, depth drawn twofold")
+    right.set_title("The surface, depth enlarged twice")
     return page
 
 
@@ -424,7 +425,7 @@ def _surface_views(
     zoom: float = 1.12,
     every: int = 1,
 ) -> float:
-    """Iso-depth lines over the image, and a still of `every` n-th point of them; returns the lines' spacing in mm."""
+    """Draw lines of equal depth on the image, and `every` n-th point of the surface; return the lines' spacing in mm."""
     h, w = image.shape[:2]
     step = max(1, w // 128)
     y, x = np.arange(0, h, step), np.arange(0, w, step)
@@ -443,9 +444,9 @@ def _surface_views(
 
 
 def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
-    """A row for each simulated scene: the left image, the surface as lines and as a body, the error along the view.
+    """A row for each simulated scene: the left image, the surface as lines and in 3D, the error along the view.
 
-    Where a scene is an eye, the error of the sphere prior stands last.
+    If the scene is an eye, the last panel shows the error of the sphere prior.
     """
     with_sphere = any(one.sphere_error_mm is not None for one in found)
     columns = 5 if with_sphere else 4
@@ -463,8 +464,8 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
         show_image(axes[0], pair.left, f"{pair.name}: left image")
         step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig, zoom=1.25, every=2)
         axes[2].set(xlabel="", ylabel="", zlabel="", xticklabels=[], yticklabels=[], zticklabels=[])
-        axes[2].set_title("Depth drawn twofold", y=0.98)
-        axes[1].set_title(f"Depth lines, every {step_mm:g} mm")
+        axes[2].set_title("Depth enlarged twice", y=0.98)
+        axes[1].set_title(f"Lines of equal depth, every {step_mm:g} mm")
         for ax, error, rms, name in zip(
             axes[3:],
             (one.error_mm, one.sphere_error_mm),
@@ -485,7 +486,7 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
 
 
 def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept: np.ndarray) -> Figure:
-    """For each set of matches the share of wrong ones among the surest `kept` (k,), by each confidence (AUC, share)."""
+    """Share of wrong matches among the share `kept` (k,) of the most confident ones, for each set and confidence."""
     page, axes = figure(1, len(curves), width_in=4.6 * len(curves), height_in=3.3, squeeze=False)
     colours = {"score": "ours", "peak_ratio": "warning", "reciprocal": "truth"}
     for ax, (name, measures) in zip(axes[0], curves.items(), strict=True):
@@ -493,8 +494,8 @@ def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept:
             label = f"{measure.replace('_', ' ')} (AUC {auc:.2f})"
             ax.plot(100 * kept, 100 * share, color=COLOURS[colours[measure]], label=label)
         nothing, highest = 100 * next(iter(measures.values()))[1][-1], max(share.max() for _, share in measures.values())
-        ax.axhline(nothing, color=COLOURS["baseline"], ls="--", label="told nothing")
-        ax.set(xlabel="surest matches kept (%)", title=name, ylim=(0, 1.5 * max(nothing, 100 * highest)))
+        ax.axhline(nothing, color=COLOURS["baseline"], ls="--", label="all matches")
+        ax.set(xlabel="most confident matches kept (%)", title=name, ylim=(0, 1.5 * max(nothing, 100 * highest)))
         ax.legend(fontsize=8, loc="upper right")
     axes[0, 0].set_ylabel("wrong by more than 2 px (%)")
     return page
@@ -521,16 +522,16 @@ def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
                 rms = (np.sqrt(np.mean(found[f"{name}_{key}_um"] ** 2)) for key in ("robot_frame", "rigid", "affine"))
                 rows.append([f"{setting}: {name.replace('_', ', ')} cameras", *numbers(rms)])
     if rows:
-        header = ["75 frames", "RMS (um)", "rigid motion taken out", "affine map taken out"]
+        header = ["75 frames", "RMS (um)", "after a rigid map (um)", "after an affine map (um)"]
         made = f"{when(calibrated)} {weights(calibrated)}"
         tables.append(table(header, rows, f"{made}: {caption} Cameras calibrated from 75 detected frames.").data)
     return HTML("".join(tables))
 
 
 def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
-    """Recorded CPU and wall seconds, and errors, of `l1_solver`, `reconstruction_speed` and `matching`.
+    """Recorded CPU seconds, wall seconds and errors of `l1_solver`, `reconstruction_speed` and `matching`.
 
-    CPU seconds hold on a busy machine, wall seconds on an idle one.
+    CPU seconds are right also if the machine was busy, wall seconds only if it was idle.
     """
     names = ("l1_solver", "reconstruction_speed", "matching")
     rows = [
@@ -538,7 +539,7 @@ def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
             f"Eq. 6, {e['control']:.0f} x {e['control']:.0f}, n = {e['n_points']:.0f}",
             f"{e['cpu_s']:.3f}",
             "",
-            f"objective {abs(e['relative_difference']):.0e} from CLARABEL's",
+            f"objective differs from CLARABEL's by {abs(e['relative_difference']):.0e}",
             f"CLARABEL {e['clarabel_cpu_s']:.2f} s, {e['clarabel_over_ours']:.0f} times ours",
         ]
         for e in (recorded["l1_solver"].rows if "l1_solver" in recorded else ())
@@ -571,7 +572,7 @@ def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
 def tool_over_surface(
     image: np.ndarray, surface: BSplineSurface, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance
 ) -> Figure:
-    """The image, and the heights of the landmarks (3, 3) mm above the surface, along the tool."""
+    """The image with a line along the tool, and the heights of the landmarks (3, 3) mm above the surface along it."""
     page, (left, right) = figure(1, 2, width_in=11, height_in=3.8, width_ratios=(1, 1.3))
     u, mm_per_px = rig.left.project(x_tool_mm), 1 / np.linalg.norm(rig.left.linear[0])
     show_image(left, image, "Left image, and the line along the tool")
@@ -595,25 +596,25 @@ def tool_over_surface(
         if not known[k]:
             continue
         far, place = distance.along_view_mm[k], (u[k] - tip) @ along * mm_per_px
-        label = f"{name}: {1e3 * far:.0f} um above it" if np.isfinite(far) else f"{name}: beyond the surface"
+        label = f"{name}: {1e3 * far:.0f} um above the surface" if np.isfinite(far) else f"{name}: outside the surface"
         left.plot(*u[k], "o", color=colour, markeredgecolor="black")
-        # A landmark beside the line stands as far above it as it stands above the surface that it covers.
+        # A landmark beside the line is drawn at its own height above the surface, added to that of the line.
         ground = np.interp(place, along_mm, height_mm)
-        nudge = (0.0, -0.09, 0.09)[k]  # the tips are about as far along: one must not hide the other
+        nudge = (0.0, -0.09, 0.09)[k]  # both tips are about equally far along the tool: draw them side by side
         right.plot([place + nudge] * 2, [ground, ground + far], color=colour, lw=3)
         right.plot(place + nudge, ground + far, "o", color=colour, markeredgecolor="black", zorder=3, label=label)
         ends.append((place + nudge, ground + far))
     for end in ends[1:] if known[0] else ():
         right.plot(*zip(ends[0], end, strict=True), color=COLOURS["baseline"], lw=1.2, zorder=1)
-    right.set(xlabel="along the tool (mm)", ylabel="height (mm)", title="The distances that all this is for")
+    right.set(xlabel="along the tool (mm)", ylabel="height (mm)", title="Distance of the tool from the surface")
     right.set_ylim(bottom=-0.3)
     right.legend(fontsize=9)
     return page
 
 
 def case_table(found: Sequence[Case], caption: str) -> HTML:
-    """Surface error of simulated scenes, and of the sphere prior on eyes."""
-    header = ["scene", "matches used", "surface RMS (um)", "depth RMS (um)", "sphere prior RMS (um)", "times better"]
+    """Surface errors of simulated scenes, and of the sphere prior for eyes."""
+    header = ["scene", "matches used", "surface RMS (um)", "depth RMS (um)", "sphere prior RMS (um)", "sphere / surface"]
     rows = []
     for one in found:
         depth = 1e3 * one.error_mm[one.seen] @ one.pair.rig.left.viewing_direction
@@ -637,7 +638,7 @@ def atomic_maps(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
 
 
 def vertex_colours(mesh: Mesh) -> np.ndarray:
-    """Colour (n, 3) uint8 of each vertex in the mesh's texture; grey without one."""
+    """Colours (n, 3) uint8 of the vertices from the mesh's texture; grey without one."""
     if mesh.texture is None:
         return np.full((len(mesh.u), 3), 160, dtype=np.uint8)
     h, w = mesh.texture.shape[:2]
@@ -648,7 +649,7 @@ def vertex_colours(mesh: Mesh) -> np.ndarray:
 def scene_view(
     mesh: Mesh, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance, sd_um: float, *, height_px: int = 560
 ) -> go.Figure:
-    """A plotly scene that turns under the mouse: surface, forceps (3, 3) mm, both cameras' rays, the tip's distance."""
+    """A plotly scene: surface, forceps (3, 3) mm, rays of both cameras, and the first tip's distance along the view."""
     import plotly.graph_objects as go
 
     colours = [f"rgb({r},{g},{b})" for r, g, b in vertex_colours(mesh).tolist()]
@@ -676,17 +677,17 @@ def scene_view(
             line(np.array([tips[0], below]), said, "#111111", 8)
     axes = {f"{axis}axis": {"title": f"{axis} (mm)", "nticks": 4 if axis == "z" else 6} for axis in "xyz"}
     up, (right, down) = -rig.left.viewing_direction, _across(rig)
-    eye = 1.1 * up + 1.4 * down + 0.3 * right  # as one who sits in front of the image
+    eye = 1.1 * up + 1.4 * down + 0.3 * right  # as if sitting in front of the image
     camera = {name: dict(zip("xyz", v.tolist(), strict=True)) for name, v in (("up", up), ("eye", eye))}
     view.update_layout(
         scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        height=height_px, legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},  # below: a small screen has no room
+        height=height_px, legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},  # below the scene, for small screens
     )  # fmt: skip
     return view
 
 
 def growing(responses: Mapping[str, np.ndarray]) -> Figure:
-    """Response maps of one patch at growing sizes, each in units of its peak."""
+    """Response maps of one patch at growing sizes, each divided by its peak."""
     page, axes = figure(1, len(responses), width_in=3.6 * len(responses), height_in=2.9)
     for ax, (name, response) in zip(axes, responses.items(), strict=True):
         high = int((response > 0.8 * response.max()).sum())
@@ -699,7 +700,7 @@ def growing(responses: Mapping[str, np.ndarray]) -> Figure:
 
 
 def spline_1d(t: np.ndarray, data: np.ndarray, wrong: np.ndarray, curves: Mapping[str, np.ndarray]) -> Figure:
-    """Points of one dimension, the wrong ones as crosses, and curves through them."""
+    """Data points over t, the wrong ones as crosses, and named curves."""
     page, ax = figure(width_in=8, height_in=3.4)
     ax.plot(t[~wrong], data[~wrong], ".", color=COLOURS["baseline"], label="points")
     ax.plot(t[wrong], data[wrong], "x", color=COLOURS["warning"], label="wrong points")
@@ -711,7 +712,7 @@ def spline_1d(t: np.ndarray, data: np.ndarray, wrong: np.ndarray, curves: Mappin
 
 
 def epipolar_line(left: np.ndarray, right: np.ndarray, rig: StereoRig, pixel: np.ndarray, matches: Matches) -> Figure:
-    """A pixel of the left image; its line in the right one with ticks of 500 um of depth; and the nearest match."""
+    """A pixel of the left image, its epipolar line in the right one with ticks every 500 um of depth, the nearest match."""
     n, e = rig.epipolar_normal, -rig.epipolar_normal @ rig.offset_px
     along = np.array([n[3], -n[2]]) / np.hypot(n[2], n[3])
     foot = -(n[:2] @ pixel + e) * n[2:] / (n[2:] @ n[2:])
@@ -721,7 +722,7 @@ def epipolar_line(left: np.ndarray, right: np.ndarray, rig: StereoRig, pixel: np
     page, axes = figure(1, 2, width_in=10, height_in=3.4)
     show_image(axes[0], left, "Left: the pixel")
     axes[0].plot(*pixel, "o", color="white", markeredgecolor="black", markersize=8)
-    show_image(axes[1], right, "Right: its line, around the nearest match")
+    show_image(axes[1], right, "Right: its epipolar line near the match")
     ends = centre + np.array([[-400.0], [400.0]]) * along
     axes[1].plot(*ends.T, color="cyan", lw=1.2)
     ticks = centre + step * np.arange(-12, 13)[:, None] * along
@@ -732,7 +733,7 @@ def epipolar_line(left: np.ndarray, right: np.ndarray, rig: StereoRig, pixel: np
 
 
 def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, paper_um: float | None = None) -> Figure:
-    """RMS surface error of variants of the pipeline, as bars."""
+    """RMS surface errors of variants of the pipeline, as bars."""
     page, ax = figure(width_in=9, height_in=0.42 * len(rms_um) + 1.1)
     names = list(rms_um)[::-1]
     values = [rms_um[name] for name in names]
@@ -755,7 +756,7 @@ def disparity_errors(
     low_px: float = 0.1,
     limit_px: float = 4.0,
 ) -> Figure:
-    """A real image, its measured disparity (h, w), and for each matcher its points (n, 2) and errors (n,) px."""
+    """A real image, its measured disparity (h, w) px, and each matcher's errors (n,) px at its points (n, 2) px."""
     columns = (3 + len(errors_px)) // 2
     page, axes = figure(2, columns, width_in=4.3 * columns, height_in=5.6)
     panels = axes.ravel()
@@ -765,7 +766,7 @@ def disparity_errors(
     for ax, (name, (u, error)) in zip(panels[2:], errors_px.items(), strict=False):
         show_image(ax, np.full_like(_grey(image), 255), f"{name}: median {np.median(np.abs(error)):.2f} px")
         ax.images[0].set(cmap="gray", clim=(0, 255))
-        # Squares as wide as the lattice, so that the map has no holes but where nothing is scored.
+        # Squares as wide as the lattice's step, so that the map has holes only where nothing is scored.
         step_px = float(np.median(KDTree(u).query(u, k=2)[0][:, 1])) if len(u) > 1 else 1.0
         size_pt = 72 * 3.9 * step_px / image.shape[1]  # a panel is about 3.9 in wide
         errors = np.clip(np.abs(error), low_px, limit_px)
@@ -785,6 +786,6 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 
 def _across(rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (3,) across the left view: right and down in the image, made orthogonal to the view."""
+    """Unit vectors (3,) orthogonal to the left view: to the right and down in the image."""
     camera = rig.left.resect()
     return camera.R[0], camera.R[1]

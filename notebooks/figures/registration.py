@@ -1,4 +1,4 @@
-"""Figures of notebook 05: the moved microscope, errors against frames, ICP, noise in 3D, drift, one camera alone."""
+"""Figures of notebook 05: moved microscope, errors against frames, ICP, noise in 3D, drift, a single moved camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lib.registration import DriftMonitor
 from notebooks.figures.style import COLOURS, figure
 from notebooks.studies.moved_cameras import MotionErrors
 
-#: Fewer trials have no quartiles worth drawing.
+#: With fewer trials, quartiles are not drawn.
 _FEW = 30
 _ESTIMATORS = {
     "squared norms": (COLOURS["baseline"], "s", "--"),
@@ -36,22 +36,22 @@ def moved_tool(
     x_registered: np.ndarray,
     microscope_from_robot: RigidTransform,
 ) -> Figure:
-    """The tool's landmarks from above and from the side: reported by the robot, seen by the stale rig, registered.
+    """The tool's landmarks from above and from the side: from the robot, from the old rig, and registered.
 
     Parameters
     ----------
     x_robot, x_stale, x_registered:
-        (n, 3, 3) mm, n frames of base, tip_1, tip_2.
+        (n, 3, 3) mm: base, tip_1, tip_2 in n frames.
     """
     sets = (
         ("robot", x_robot, COLOURS["truth"], 6.0),
-        ("stale rig", x_stale, COLOURS["paper"], 1.4),
+        ("old rig", x_stale, COLOURS["paper"], 1.4),
         ("registered", x_registered, COLOURS["ours"], 1.4),
     )
     seen = np.concatenate([microscope_from_robot.apply(x).reshape(-1, 3) for _, x, _, _ in sets])
     low, high = seen.min(axis=0) - 0.4, seen.max(axis=0) + 0.4
     width, _, depth = high - low
-    # Side by side at one scale: what is level on the left is level on the right.
+    # Both panels have the same scale and share the y axis.
     page, axes = figure(1, 2, width_in=10, height_in=5.4, sharey=True, width_ratios=(width, depth))
     for ax, i, title in zip(axes, (0, 2), ("From above", "From the side"), strict=True):
         for label, x, colour, line_width in sets:
@@ -69,7 +69,7 @@ def moved_tool(
 def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None = 150.0, title: str = "") -> Figure:
     """The paper's figure "Tool Registration": RMS errors against the number of frames.
 
-    Many trials have their quartiles as a band; fewer than `_FEW` are shown one by one.
+    A band shows the quartiles of the trials; fewer than `_FEW` trials are drawn one by one.
     """
     page = plt.figure(figsize=(10, 5.4), layout="constrained")
     panels = page.subplot_mosaic([["shift", "X"], ["shift", "Y"], ["shift", "Z"]], width_ratios=(1.5, 1))
@@ -87,7 +87,7 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
         for k in range(3):
             axes[k + 1].plot(n, error.euler_rms_deg[:, k], **style)
     if paper_um is not None:
-        axes[0].axhline(paper_um, color=COLOURS["warning"], linestyle=":", label="paper: below this after 3")
+        axes[0].axhline(paper_um, color=COLOURS["warning"], linestyle=":", label="paper: below this after 3 frames")
     ticks = list(next(iter(errors.values())).n_frames)
     shared = [value for error in errors.values() for value in error.euler_rms_deg.ravel()]
     for k, ax in enumerate(axes):
@@ -112,7 +112,7 @@ def _plain_log_ticks(ax, digits: Sequence[int] = (1, 2, 5)) -> None:
 
 
 def icp_chart(shift_mm: Sequence[float], error_um: Mapping[str, np.ndarray]) -> Figure:
-    """Errors (trials, k) of each method against the size of the motion, its median as a line."""
+    """Errors (trials, k) of each method against the size of the motion (k,), with their median as a line."""
     page, ax = figure(1, 1, width_in=8, height_in=3.8)
     for (name, errors), colour in zip(error_um.items(), (COLOURS["ours"], COLOURS["paper"]), strict=True):
         ax.plot(np.broadcast_to(shift_mm, errors.shape).ravel(), errors.ravel(), ".", color=colour, alpha=0.3)
@@ -126,7 +126,7 @@ def icp_chart(shift_mm: Sequence[float], error_um: Mapping[str, np.ndarray]) -> 
 
 
 def noise_ellipses(rig: StereoRig, sigma_px: float, microscope_from_robot: RigidTransform) -> Figure:
-    """One-sigma ellipses of a triangulated landmark, from above and from the side, to one scale."""
+    """One-sigma ellipses of a triangulated landmark, from above and from the side, at the same scale."""
     covariance_px2 = sigma_px**2
     covariance = rig.triangulate(np.zeros((1, 2)), np.zeros((1, 2)), covariance_px2).covariance_mm2[0]
     covariance = 1e6 * microscope_from_robot.R @ covariance @ microscope_from_robot.R.T
@@ -149,16 +149,16 @@ def noise_ellipses(rig: StereoRig, sigma_px: float, microscope_from_robot: Rigid
 
 
 def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
-    """Left: chi-square of each frame; right: the cumulative sum with its alarm level."""
+    """Chi-square of each frame (left); cumulative sum and alarm level (right)."""
     page, axes = figure(1, 2, width_in=12, height_in=3.8)
     colours = [COLOURS["baseline"], COLOURS["right"], COLOURS["ours"], COLOURS["paper"]]
     for (name, monitor), colour in zip(monitors.items(), colours, strict=False):
         chi2, freedom, statistic = np.array(monitor.history).T
         axes[0].plot(chi2 / freedom, color=colour, linewidth=1.0, label=name)
         axes[1].plot(statistic, color=colour, label=name)
-    axes[0].set(yscale="log", xlabel="frame", title="One frame: chi-square per degree of freedom")
+    axes[0].set(yscale="log", xlabel="frame", title="Chi-square of a frame per degree of freedom")
     axes[1].axhline(1.0, color="black", linestyle=":", linewidth=1)
-    axes[1].set(ylim=(0, 3), xlabel="frame", title="Cumulative sum, and the alarm level")
+    axes[1].set(ylim=(0, 3), xlabel="frame", title="Cumulative sum and alarm level")
     for ax in axes:
         ax.axvline(shift_at - 0.5, color=COLOURS["truth"], linestyle="--", linewidth=1)
     axes[1].legend(loc="upper left")
@@ -166,7 +166,7 @@ def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
 
 
 def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figure:
-    """Left: how much worse each hypothesis explains the landmarks; right: triangulation error after each remedy."""
+    """BIC of each hypothesis less that of the best one (left); triangulation error after each correction (right)."""
     page, axes = figure(1, 2, width_in=11, height_in=3.4)
     names = list(bic)
     excess = np.array([bic[name] for name in names])
@@ -178,26 +178,26 @@ def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figur
     axes[0].set(xlabel="BIC above the best", xlim=(0, 1.15 * excess.max()), title="Which camera moved?")
     axes[0].invert_yaxis()
     _bars(axes[1], list(error_um), list(error_um.values()))
-    axes[1].set(xlabel="RMS triangulation error in um", title="What it costs to be wrong")
+    axes[1].set(xlabel="RMS triangulation error in um", title="Error after each correction")
     for ax in axes:
         ax.grid(axis="y", visible=False)
     return page
 
 
 def weights_view(error_um: Mapping[str, np.ndarray], off_px: np.ndarray, weights: np.ndarray, title: str) -> Figure:
-    """Left: what each loss leaves at the landmarks of a tool; right: the weights (n,) that Eq. (7) gives to landmarks
-    whose detections are `off_px` (n,) wrong."""
+    """Errors (n,) um of the landmarks after registration with each loss (left); weights (n,) that Eq. (7) gives to
+    landmarks, against the larger error `off_px` (n,) of their two detections (right)."""
     page, (left, right) = figure(1, 2, width_in=11, height_in=3.6)
     looks = {"squared": ("squared norms", "paper"), "norm": ("sum of norms, Eq. (7)", "ours")}
     for loss, (name, colour) in looks.items():
         share = 100 * np.arange(1, len(error_um[loss]) + 1) / len(error_um[loss])
         left.plot(np.sort(error_um[loss]), share, color=COLOURS[colour], label=name)
-    left.set(xscale="log", xlim=(5, 5e4), xlabel="left after registration (um)", ylabel="landmarks below (%)")
+    left.set(xscale="log", xlim=(5, 5e4), xlabel="error after registration (um)", ylabel="landmarks below (%)")
     left.set_title(title)
     left.legend(loc="lower right", fontsize=9)
     right.plot(off_px, weights / weights.max(), "o", color=COLOURS["ours"], markersize=5, alpha=0.7)
-    right.set(xscale="log", xlim=(0.3, 200), xlabel="the worse of its two detections is off by (px)")
-    right.set(yscale="log", ylim=(1e-4, 2), ylabel="weight (largest 1)", title="Whom Eq. (7) believes")
+    right.set(xscale="log", xlim=(0.3, 200), xlabel="larger error of the two detections (px)")
+    right.set(yscale="log", ylim=(1e-4, 2), ylabel="weight (largest 1)", title="Weights of the landmarks in Eq. (7)")
     for axis in (left.xaxis, right.xaxis, right.yaxis):
         axis.set_major_formatter("{x:g}")
     return page
