@@ -218,8 +218,8 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
 
 def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """Arguments of `_reason`: how the tool moved, the optics that the cameras imply, and the volume that the tool covered."""
-    x = c.x_mm[c.inliers]
-    if data is not None and np.ptp(landmark := data.landmark[c.inliers]):
+    used, x = c.inliers, c.x_mm[c.inliers]
+    if data is not None and np.ptp(landmark := data.landmark[used]):
         own = extents(np.concatenate([x[landmark == k] - x[landmark == k].mean(axis=0) for k in np.unique(landmark)]))
         shape, size_mm = ("line", own[1]) if own[1] < LIMITS["one_line"][0] * robot_mm else ("plane", own[2])
         text = f"Each landmark stays within {size_mm:.3f} mm (RMS) of one {shape}. Across it the calibration relies on the "
@@ -258,7 +258,9 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
-    alone, both = (c.depth_sd_mm(corners, detection=detection).max() for detection in (False, True))
+    px2 = c.noise_px2 if c.covariance_px2 is None else (c.covariance_px2 + 0 * c.y_px[:, :, None])[used]  # NaN: not seen
+    usual_px2 = np.nanmedian(np.diagonal(px2.T)) * np.eye(len(px2.T))  # a few uncertain detections would dominate the mean
+    alone, both = (c.depth_sd_mm(corners, detection=noise).max() for noise in (False, usual_px2))
     sizes = " x ".join(f"{value:.1f}" for value in high - low)
     text = f"The tool covers {sizes} mm: at its corners the calibration alone has a depth error of {1e3 * alone:.0f} um (sd)."
     cure = "Move the tool through more depths and corners; notebook 03 finds the most informative positions."

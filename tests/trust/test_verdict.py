@@ -65,6 +65,15 @@ def test_clean_data_of_any_size_are_never_red(n):
     assert LEVELS[2] not in levels and (n < 12 or not levels)
 
 
+def test_vague_detections_do_not_hide_that_the_cameras_are_the_largest_error():
+    data = made(12, 0, 0.5, sigma_u_px=0.5, half_size_mm=(8.0, 4.5, 0.4))
+    vague = np.arange(12) % 3 == 0
+    errors = np.random.default_rng(0).normal(0, 30, (2, 12, 2)) * vague[:, None]
+    covariance = data.covariance_px2 * np.where(vague, 60.0**2, 1.0)[:, None, None, None]
+    unsure = replace(data, u_left=data.u_left + errors[0], u_right=data.u_right + errors[1], covariance_px2=covariance)
+    assert names(data) == {} and names(unsure) == {"coverage": LEVELS[1]}
+
+
 @pytest.mark.parametrize("half_depth_mm", [0.0, 0.01, 0.03])
 def test_few_clean_rows_in_a_plane_are_calibrated_and_never_trusted(half_depth_mm):
     for seed in range(10):
