@@ -51,6 +51,7 @@ _SURE_GAIN = 1.0
 #: robot's landmarks must move for another such round.
 _GUIDED, _SETTLED = 3, 0.01
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
+_UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which clicks are worth while
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
@@ -376,10 +377,12 @@ class _Work:
             "the frames for judging agree better with the robot, and left with right": True,
         }
         labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
+        unsure = not len(self.marked) and np.nanmax(labels_sd_px) > _UNSURE * np.nanmean(length)
         self.report["notes"].append(
             "The robot's labels in the images have standard deviations of "
             f"{', '.join(f'{sd:.1f}' for sd in labels_sd_px)} px ({', '.join(LANDMARKS)}). Most of that error is the same in "
             "all frames. So neither the agreement with the robot nor the weights' covariance and confidence contain it."
+            + f" Label {_OVERRULE} pairs or more and adapt again with --labels: they determine most of it." * bool(unsure)
         )
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),

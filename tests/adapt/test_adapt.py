@@ -409,12 +409,15 @@ def test_the_stated_deviations_of_the_labels_cover_their_errors(world, continued
     off = found.told - np.asarray(world.u)[found.frames["judge"]]
     assert (np.sqrt(np.nanmean(off**2, axis=(0, 1, 3))) < 3 * sd_px).all() and (sd_px < 3.0).all()
     assert ", ".join(f"{sd:.1f}" for sd in sd_px) in found.report["notes"][-1]
+    assert "--labels" not in found.report["notes"][-1]
 
 
-def test_a_good_detector_is_left_alone(world, recording, tmp_path):
+def test_a_good_detector_is_left_alone(world, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_UNSURE", 0.001)
     detector = StandIn(world.u, noise_px=0.2)
     found = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
     assert not found.improved and found.detector is detector and found.report["reason"]
+    assert "Label 5 pairs or more and adapt again with --labels" in found.report["notes"][-1]
 
 
 def test_below_a_tenth_it_says_how_many_to_label(world, recording, tmp_path):
