@@ -51,7 +51,7 @@ _SURE_GAIN = 1.0
 #: robot's landmarks must move for another such round.
 _GUIDED, _SETTLED = 3, 0.01
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
-_UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which clicks are worth while
+_UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which clicks pay
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
