@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from lib import files, paths
 from lib.adapt.loop import Adaptation, adapt, adapt_images
 from lib.landmarks import Detector
-from lib.recordings import Recording
+from lib.recordings import Recording, StereoFrame
 from lib.trust.check import data_uri, overlay
 
 _NUMBERS = {
@@ -44,16 +44,29 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
 
 
 def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
-    """(caption, picture) of the best, the median and the worst frame for judging, each before (above) and after (below)."""
+    """(caption, picture) of the tool in the best, the median and the worst frame for judging, before (above) and after."""
     order = np.argsort(found.after.relative)[: np.isfinite(found.after.relative).sum()]
     pictures = []
     for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True) if len(order) else ():
         number = int(found.frames["judge"][order[i]])
-        rows = [overlay(recording.frames[number], own.u[order[i]], found.told[order[i]], 520) for own in found.seen]
+        told, pair = found.told[order[i]], recording.frames[number]
+        side, corners = _around(told, np.array(recording.image_size_px))
+        left, right = (v[y : y + side, x : x + side] for v, (x, y) in zip((pair.left, pair.right), corners, strict=True))
+        cut, corners = StereoFrame(left, right, pair.time_s), corners[:, None]
+        rows = [overlay(cut, own.u[order[i]] - corners, told - corners, 520) for own in found.seen]
         share = 100 * found.after.relative[order[i]]
         caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above: before. Below: after."
         pictures.append((caption, data_uri(np.vstack(rows), ".jpg")))
     return pictures
+
+
+def _around(told: np.ndarray, size: np.ndarray) -> tuple[int, np.ndarray]:
+    """Side and upper left corners (2, 2), px, of a square around landmarks (2, k, 2) px in each of two images of a `size`."""
+    known = [u[np.isfinite(u).all(axis=1)] for u in told]
+    extent = max(np.ptp(u, axis=0).max(initial=0.0) for u in known if len(u))
+    side = int(min(max(2.5 * extent, 100), size.min()))
+    middle = np.stack([u.mean(axis=0) if len(u) else size / 2 for u in known])
+    return side, np.clip(middle.astype(int) - side // 2, 0, size - side)
 
 
 def main(argv: list[str]) -> int:

@@ -94,7 +94,8 @@ class Check:
         score = np.clip(np.nan_to_num(health.score, nan=1e3), 1e-2, 1e3)
         time.semilogy(self.recording.frames.time_s[health.frame], score, "k.", ms=4)
         time.axhline(1.0, color="#b42318", lw=1)
-        time.set(title="score of a frame (bad above 1)", xlabel="time of the video (s)")
+        limits = min(0.1, 0.8 * score.min(initial=1.0)), max(10.0, 1.2 * score.max(initial=1.0))  # at least two decades
+        time.set(title="score of a frame (bad above 1)", xlabel="time of the video (s)", ylim=limits)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3]
 

@@ -1,11 +1,13 @@
 """The robot as a teacher: half-wrong detections are enough, and a robot that errs teaches nothing wrong."""
 
+import base64
 import json
 import re
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -669,6 +671,8 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
+    picture = base64.b64decode(re.search(r'data:image/jpeg;base64,([^"]+)', page)[1])
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (1040, 1046, 3)  # the tool, large
     card = (out / "weights.md").read_text(encoding="utf-8")
     assert "Learning curve" in page and "| within 5 %, % |" in card and "standard deviations of" in card
     said = capsys.readouterr().out
