@@ -302,7 +302,7 @@ def test_notebook_7_says_what_to_do_on_a_red_verdict(small, monkeypatch, capsys)
     assert re.search(r"^Then what\? +Look\.$", capsys.readouterr().out, re.MULTILINE)
 
 
-def answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause=None):
+def answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause=None, **parameters):
     """What notebook 7 answers in words where the verdict has these reasons: (name, level, text, cure)."""
     told = trust.Verdict(tuple(trust.Reason(*reason) for reason in reasons))
     found = None if cause is None else SimpleNamespace(name=cause, text="The cause.", cure="Mend the cause.")
@@ -310,7 +310,7 @@ def answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause=None):
     monkeypatch.setattr(
         check, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=told, diagnosis=diagnosis)
     )
-    Run("07", small, monkeypatch)
+    Run("07", small, monkeypatch, **parameters)
     return re.sub(r"\s+", " ", capsys.readouterr().out)
 
 
@@ -333,6 +333,8 @@ def test_notebook_7_without_a_cause_asks_for_the_detector_and_for_motion(small, 
     said = answers_of_notebook_7(small, monkeypatch, capsys, *reasons)
     assert "Enough motion? In doubt. Text of one_plane. Cure of one_plane. Text of thin. Cure of thin. Do" in said
     assert re.search(r"usable\? No\. \d of 6 frames are bad\. Then what\? Adapt; then label 10 stereo frames\.", said)
+    part = answers_of_notebook_7(small, monkeypatch, capsys, *reasons, frames="1:5")
+    assert re.search(r"usable\? No\. \d of 4 frames are bad\.", part)
 
 
 @pytest.mark.parametrize("labelled", [0, 1, 4])
@@ -350,6 +352,8 @@ def test_notebook_7_asks_for_more_labels_where_few_frames_have_some(labelled, sm
     cures = [reason.cure for reason in run.verdicts[0].reasons if reason.name == "few_frames"]
     assert len(cures) == 1 and "annotate" in cures[0] and "Record more" not in capsys.readouterr().out
     assert run.captions[0] == "Your labels in frame 0." and run.left_out is None
+    part = Run("07", mine, monkeypatch, landmarks="annotations", frames="3:6")
+    assert "labels in 1 stereo frames" in part.left_out  # those of frames 0 to 2 do not count
 
 
 def test_wrong_labels_come_before_the_noise_that_they_make(small):

@@ -62,17 +62,17 @@ def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Cali
     return assessed.calibration
 
 
-def labelled_pairs(recording: Recording) -> int:
-    """The number of stereo frames in which a landmark is labelled in both images."""
+def labelled_pairs(recording: Recording, frames: range) -> int:
+    """The number of stereo frames, among `frames`, in which a landmark is labelled in both images."""
     if (marks := recording.annotations) is None:
         return 0
-    return int((np.isfinite(marks.u_left) & np.isfinite(marks.u_right)).all(axis=2).any(axis=1).sum())
+    return int((np.isfinite(marks.u_left) & np.isfinite(marks.u_right)).all(axis=2).any(axis=1)[frames].sum())
 
 
-def asking_for_labels(recording: Recording, assessed: Assessment) -> Assessment:
-    """An assessment by labels; if these are few, its cures ask for more labels, not more frames."""
-    pairs = labelled_pairs(recording)
-    if pairs >= min(_ENOUGH_LABELS, len(recording)):
+def asking_for_labels(recording: Recording, assessed: Assessment, frames: range) -> Assessment:
+    """An assessment by the labels of `frames`; if these are few, its cures ask for more labels, not more frames."""
+    pairs = labelled_pairs(recording, frames)
+    if pairs >= min(_ENOUGH_LABELS, len(frames)):
         return assessed
     where = shlex.quote(paths.shown(recording.folder))
     cure = f"Label more stereo frames, far apart: `python3 -m lib annotate {where}`. {_ENOUGH_LABELS} are enough."
