@@ -77,7 +77,7 @@ def test(argv: list[str]) -> int:
     from lib.parallel import cores
 
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
-    workers = f"--numprocesses={cores() + 1}"  # one more than there are cores: some tests wait for other processes
+    workers = f"--numprocesses={cores() + 1}"  # one more than cores, since some tests wait for processes
     plugins = ["-p", "xdist", "-p", "hypothesispytest"]
     return _pytest([*plugins, workers, "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
@@ -100,7 +100,7 @@ def _pytest(argv: list[str]) -> int:
     keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # loading every installed plugin takes time
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
     environ = keep | os.environ
-    environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without bytecode each worker compiles all tests anew, for seconds
+    environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each worker compiles all tests anew: seconds
     return subprocess.call(command, env=environ)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.teacher import RefusalError, Teacher, longest_still, teach
+from lib.adapt.teacher import LABEL, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -51,7 +51,7 @@ _SURE_GAIN = 1.0
 #: robot's landmarks must move for another such round.
 _GUIDED, _SETTLED = 3, 0.01
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
-_UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which clicks pay
+_UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which it asks for clicks
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
@@ -382,7 +382,7 @@ class _Work:
             "The robot's labels in the images have standard deviations of "
             f"{', '.join(f'{sd:.1f}' for sd in labels_sd_px)} px ({', '.join(LANDMARKS)}). Most of that error is the same in "
             "all frames. So neither the agreement with the robot nor the weights' covariance and confidence contain it."
-            + f" Label {_OVERRULE} pairs or more and adapt again with --labels: they determine most of it." * bool(unsure)
+            + f" {LABEL} They determine most of that error." * bool(unsure)
         )
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),

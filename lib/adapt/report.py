@@ -10,9 +10,12 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from lib import files, paths
 from lib.adapt.loop import Adaptation, adapt, adapt_images
 from lib.landmarks import Detector
+from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.windows import cut, map_points, tool_pose, window_from_image
 from lib.recordings import Recording, StereoFrame
 from lib.trust.check import data_uri, overlay
 
+_SHOWN_PX = 520  # side of the part of an image that is shown; the tool takes 0.4 of it
 _NUMBERS = {
     "median_px": "median distance from the robot, px",
     "median_sigmas": "the same in stated standard deviations (0.8 if these are right)",
@@ -50,23 +53,15 @@ def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
     for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True) if len(order) else ():
         number = int(found.frames["judge"][order[i]])
         told, pair = found.told[order[i]], recording.frames[number]
-        side, corners = _around(told, np.array(recording.image_size_px))
-        left, right = (v[y : y + side, x : x + side] for v, (x, y) in zip((pair.left, pair.right), corners, strict=True))
-        cut, corners = StereoFrame(left, right, pair.time_s), corners[:, None]
-        rows = [overlay(cut, own.u[order[i]] - corners, told - corners, 520) for own in found.seen]
+        zoom = 0.4 * _SHOWN_PX / np.nanmax(tool_length_px(told))
+        matrices = window_from_image(np.nan_to_num(tool_pose(told)[0]), np.zeros(2), _SHOWN_PX, zoom)
+        views = [cut(view, matrix, _SHOWN_PX) for view, matrix in zip((pair.left, pair.right), matrices, strict=True)]
+        u = [map_points(matrices[:, None], of_both) for of_both in (*(own.u[order[i]] for own in found.seen), told)]
+        rows = [overlay(StereoFrame(*views, pair.time_s), seen, u[-1], _SHOWN_PX) for seen in u[:-1]]
         share = 100 * found.after.relative[order[i]]
         caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above: before. Below: after."
         pictures.append((caption, data_uri(np.vstack(rows), ".jpg")))
     return pictures
-
-
-def _around(told: np.ndarray, size: np.ndarray) -> tuple[int, np.ndarray]:
-    """Side and upper left corners (2, 2), px, of a square around landmarks (2, k, 2) px in each of two images of a `size`."""
-    known = [u[np.isfinite(u).all(axis=1)] for u in told]
-    extent = max(np.ptp(u, axis=0).max(initial=0.0) for u in known if len(u))
-    side = int(min(max(2.5 * extent, 100), size.min()))
-    middle = np.stack([u.mean(axis=0) if len(u) else size / 2 for u in known])
-    return side, np.clip(middle.astype(int) - side // 2, 0, size - side)
 
 
 def main(argv: list[str]) -> int:
@@ -94,9 +89,9 @@ def main(argv: list[str]) -> int:
         found = adapt(recording, Detector.load(a.weights), labels=a.labels, **how)
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))
-    reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)
+    reason = found.report["reason"].removesuffix(".")
     reason = f"{'Improved' if found.improved else 'Left alone'}: {reason}."
-    print("\n".join([reason, *found.report["notes"], f"Report: {page}"]))
+    print("\n".join([reason, *found.report["notes"]]).replace("RECORDING", where), f"Report: {page}", sep="\n")
     offset_s, sd_s = (found.report.get(name, np.nan) for name in ("offset_s", "clock_sd_s"))
     if recording is not None and abs(offset_s - recording.offset_s) > 3 * sd_s:
         cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"

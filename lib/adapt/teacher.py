@@ -62,7 +62,7 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
 _OTHER_POINT = 0.3  # prior sd of the offset from a detector's point to the labelled one, as a share of the tool's length
-_LABEL = (
+LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
 )
@@ -204,10 +204,10 @@ def teach(
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It marks another point, or the robot's tool has "
-                f"other dimensions. {_LABEL}"
+                f"other dimensions. {LABEL}"
             )
         if fault is not None and not (alone or clicked):
-            raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {_LABEL}")
+            raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {LABEL}")
         turns = offsets.turns
         own = 0.2 * OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
         offset, covariance = robots_part(offsets, own * length)
@@ -220,7 +220,7 @@ def teach(
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
     if share > NEAR:
         what = "labels" if alone else "detections"
-        raise RefusalError(f"{what}: they leave an error of {100 * share:.0f} % of the tool's length (sd). {_LABEL}")
+        raise RefusalError(f"{what}: they leave an error of {100 * share:.0f} % of the tool's length (sd). {LABEL}")
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
@@ -237,7 +237,7 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
         rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
         raise RefusalError(
             f"detector: near the robot's report it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
-            f"{100 * shares.max():.0f} %. It marks another point for {rare}. {_LABEL}"
+            f"{100 * shares.max():.0f} %. It marks another point for {rare}. {LABEL}"
         )
     with suppress(*_POOR):
         return _placed(recording, opinion.of(frames)).offsets
@@ -363,7 +363,7 @@ def _by_labels(recording: Recording, seen: Seen) -> Calibration:
             except _POOR:  # shut jaws have no axes
                 return _fitted(recording, seen, ransac_px=np.inf)
     except _POOR as error:
-        raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
+        raise RefusalError(f"labels: no cameras agree with them ({error}). {LABEL}") from error
 
 
 def _by_detections(recording: Recording, seen: Seen) -> Calibration:
@@ -394,7 +394,7 @@ def _by_detections(recording: Recording, seen: Seen) -> Calibration:
             poor = poor or (found, right)
     if best or poor:
         return (best or poor)[0]
-    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}") from competing
+    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {LABEL}") from competing
 
 
 def _reported(recording: Recording, seen: Seen) -> int:

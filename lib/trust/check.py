@@ -119,11 +119,11 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     else:
         raise ValueError(f"{found.folder}: the detector only knows {', '.join(LANDMARKS)}, and there are no annotations.")
     a = assess(found.showing(chosen), data, detector=detector)
-    step = _next(found, a, frames).replace("RECORDING", shlex.quote(paths.shown(found.folder)))
+    step = _next(found, a, chosen).replace("RECORDING", shlex.quote(paths.shown(found.folder)))
     return Check(found, a, _facts(found, a), step)
 
 
-def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
+def _next(recording: Recording, a: Assessment, frames: range) -> str:
     """The next step, in words.  Wrong time stamps come first where there is no calibration or no specific cause."""
     best = a.diagnosis.best
     unspecific = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
@@ -131,7 +131,7 @@ def _next(recording: Recording, a: Assessment, frames: range | None) -> str:
         return recording.mistimed
     if a.verdict.level != LEVELS[0]:
         return a.verdict.reasons[0].cure if best is None else best.cure
-    if frames is not None:
+    if len(frames) < len(recording):
         labels = "" if recording.skeleton == LANDMARKS else " --landmarks annotations"
         return f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}{labels}`."
     return f"{_USE} -p recording RECORDING`."

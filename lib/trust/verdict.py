@@ -218,8 +218,8 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
 
 def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """Arguments of `_reason`: how the tool moved, the optics that the cameras imply, and the volume that the tool covered."""
-    used, x = c.inliers, c.x_mm[c.inliers]
-    if data is not None and np.ptp(landmark := data.landmark[used]):
+    x = c.x_mm[c.inliers]
+    if data is not None and np.ptp(landmark := data.landmark[c.inliers]):
         own = extents(np.concatenate([x[landmark == k] - x[landmark == k].mean(axis=0) for k in np.unique(landmark)]))
         shape, size_mm = ("line", own[1]) if own[1] < LIMITS["one_line"][0] * robot_mm else ("plane", own[2])
         text = f"Each landmark stays within {size_mm:.3f} mm (RMS) of one {shape}. Across it the calibration relies on the "
@@ -258,13 +258,17 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
-    px2 = c.noise_px2 if c.covariance_px2 is None else (c.covariance_px2 + 0 * c.y_px[:, :, None])[used]  # NaN: not seen
-    usual_px2 = np.nanmedian(np.diagonal(px2.T)) * np.eye(len(px2.T))  # a few uncertain detections would dominate the mean
-    alone, both = (c.depth_sd_mm(corners, detection=noise).max() for noise in (False, usual_px2))
+    own_px2 = np.nanmedian(np.diagonal(_noise_px2(c), axis1=1, axis2=2))  # a few uncertain detections dominate a mean
+    alone, both = (c.depth_sd_mm(corners, detection=noise).max() for noise in (False, own_px2 * np.eye(c.y_px.shape[1])))
     sizes = " x ".join(f"{value:.1f}" for value in high - low)
     text = f"The tool covers {sizes} mm: at its corners the calibration alone has a depth error of {1e3 * alone:.0f} um (sd)."
     cure = "Move the tool through more depths and corners; notebook 03 finds the most informative positions."
     yield "coverage", float(alone / np.sqrt(max(both**2 - alone**2, 1e-12))), text, cure
+
+
+def _noise_px2(c: Calibration) -> np.ndarray:
+    """(inliers, m, m) px^2: covariances of the detections of a calibration, NaN where not seen; or one for all (1, m, m)."""
+    return c.noise_px2[None] if c.covariance_px2 is None else (c.covariance_px2 + 0 * c.y_px[:, :, None])[c.inliers]
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,8 +360,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     outliers = np.argwhere(seen & ~c.view_inliers)
     size_px = np.linalg.norm(c.residuals_px.reshape(*seen.shape, 2)[tuple(outliers.T)], axis=1)
     if c.rig is not None:
-        own = True if c.covariance_px2 is None else (c.covariance_px2 + 0 * c.y_px[:, :, None])[c.inliers]  # NaN: not seen
-        depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, own))
+        depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, _noise_px2(c)))
         stereo = {"optics": optics(c), "depth_um": [1e3 * np.nanmedian(depth) for depth in depths], "degrees": np.rad2deg}
     return TEMPLATES.get_template("report.txt").render(
         stereo, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,

@@ -419,7 +419,7 @@ def test_a_good_detector_is_left_alone(world, recording, tmp_path, monkeypatch):
     detector = StandIn(world.u, noise_px=0.2)
     found = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
     assert not found.improved and found.detector is detector and found.report["reason"]
-    assert "Label 5 pairs or more and adapt again with --labels" in found.report["notes"][-1]
+    assert "Label 10 pairs" in found.report["notes"][-1] and "--labels" in found.report["notes"][-1]
 
 
 def test_below_a_tenth_it_says_how_many_to_label(world, recording, tmp_path):
