@@ -14,6 +14,7 @@ import numpy as np
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
+from lib.adapt.shaft import ShaftEnd, shaft_end
 from lib.adapt.teacher import LABEL, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
@@ -30,7 +31,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 22  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 23  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -68,6 +69,7 @@ class Adaptation:
         frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
         after, seen, told: In the frames for judging: the agreement of the adapted detector with the robot, the detections
             before and after, and the robot's landmarks (m, 2, 3, 2) px.
+        shaft: Where the shaft ends; None if the pictures do not show it clearly, or labels set by hand give the base.
     """
 
     detector: Callable
@@ -78,6 +80,7 @@ class Adaptation:
     after: Agreement | None = None
     seen: tuple[Seen, ...] = ()
     told: np.ndarray | None = None
+    shaft: ShaftEnd | None = None
 
 
 def adapt(
@@ -176,6 +179,7 @@ class _Work:
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
         self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
+        self.shaft: ShaftEnd | None = None
         self.simulated: list[LabelledImage] = []  # simulated frames in the colours of this recording
         self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
@@ -290,6 +294,10 @@ class _Work:
             moved = np.linalg.norm(u - last, axis=-1) / tool_length_px(u)[..., None]
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
+        if by_hand is None:  # else the labels tell where the base is
+            self.shaft = shaft_end(recording, learn, u, teacher.sine(learn))
+            moved, teacher = teacher, teacher.with_base(self.shaft)
+            self.report["base_moved_mm"] = float(teacher.offset_mm[0, 0] - moved.offset_mm[0, 0])
         self.report["refused_frames"] = teacher.refused
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
@@ -302,7 +310,7 @@ class _Work:
             seen, refusal = self.look(f"round {k}", tuned, self.frames), {}
             try:
                 part = seen.labelled(few).of(learn)
-                found = teach(recording, part, before=teacher, opinion=guided, by_hand=by_hand)
+                found = teach(recording, part, before=teacher, opinion=guided, by_hand=by_hand).with_base(self.shaft)
                 new = teacher if self.contradicted(found) else found
             except RefusalError as refused:
                 refusal = {"refused": str(refused)}
@@ -403,7 +411,7 @@ class _Work:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
         return Adaptation(
             best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), self.parts,
-            agreements[1], seen, told,
+            agreements[1], seen, told, self.shaft,
         )  # fmt: skip
 
 

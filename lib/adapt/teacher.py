@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lib.adapt.looking import Seen
+from lib.adapt.shaft import ShaftEnd
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
@@ -61,6 +62,8 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Fewest labelled pairs that determine outliers and offsets; with fewer, the standard deviation of a robot's usual offsets.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
+#: Largest distance of the measured end of the shaft from the label, in standard deviations; a farther one is another edge.
+_ANOTHER_EDGE = 3.0
 _OTHER_POINT = 0.3  # prior sd of the offset from a detector's point to the labelled one, as a share of the tool's length
 LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
@@ -147,6 +150,32 @@ class Teacher:
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
         return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
+
+    def sine(self, frames: np.ndarray) -> np.ndarray:
+        """Sine (m, 2) of the angle between tool and image, positive if it points away from the camera; NaN without report."""
+        x = self.recording.landmarks_mm()[frames]
+        along = x[:, 1:].mean(axis=1) - x[:, 0]
+        views = np.stack([camera.viewing_direction for camera in self.calibration.cameras], axis=1)
+        return along @ views / np.linalg.norm(along, axis=1, keepdims=True)
+
+    def with_base(self, end: ShaftEnd | None) -> "Teacher":
+        """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.
+
+        A shift within one standard deviation of the end is left out, since labels of a tool that the detector knows are better.
+        """
+        if end is None:
+            return self
+        u, covariance = self.project(end.frame)
+        axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
+        along = axis / (axis**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
+        shift = np.nanmedian(((end.u - u[:, :, 0]) * along).sum(axis=-1))
+        variance = np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))
+        if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total := variance + end.sd**2):
+            return self
+        length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
+        offset[0, 0] += (abs(shift) > end.sd) * variance / total * shift * length_mm
+        own[0, 0, 0] = min(own[0, 0, 0], variance * end.sd**2 / total * length_mm**2)
+        return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u, covariance (as `project`) and visibility (m, 2, 3) of some frames; NaN where the robot is silent or refused.
