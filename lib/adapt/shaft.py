@@ -32,9 +32,9 @@ _LARGE = 0.75
 #: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  It
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.22
-#: Standard deviation of the measured end, a share of the tool's length.  Chosen, as all above, on four recordings by other
-#: renderers and on validation recordings.
-_SD = 0.01
+#: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
+#: four recordings by other renderers and on validation recordings.
+_SD, _SD_PX = 0.01, 1.0
 
 
 class ShaftEnd(NamedTuple):
@@ -96,7 +96,8 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
         low, high = ([[-back, side * radius / np.sqrt(1 - own.mean() ** 2)] for back in straight] for side in (-1, 1))
         outlines.append(np.concatenate([low[::-1], ellipse[0], high]) + [along, across] + (np.array(_SIZE_PX) - 1) / 2)
     found = u[:, :, 0] + along / _LENGTH_PX * axis
-    return ShaftEnd(frames, found, _SD, np.stack(means).round().astype(np.uint8), np.stack(outlines))
+    sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(np.linalg.norm(axis, axis=-1))))
+    return ShaftEnd(frames, found, sd, np.stack(means).round().astype(np.uint8), np.stack(outlines))
 
 
 def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:

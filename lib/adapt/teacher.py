@@ -161,7 +161,7 @@ class Teacher:
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
         """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.
 
-        A shift within one standard deviation of the end is left out, since labels of a tool that the detector knows are better.
+        A shift within the end's standard deviation is left out, since labels of a tool that the detector knows are better.
         """
         if end is None:
             return self
