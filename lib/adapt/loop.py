@@ -405,7 +405,8 @@ class _Work:
             "landmark_offset_turns_axes": teacher.turns,
             "labels_sd_px": labels_sd_px,
             "gauge": "An offset that all landmarks share looks like a shift of the cameras; the standard deviations do not "
-            "include it. A robot's offset looks like a constant error of the detector; labels set by hand distinguish them.",
+            "include it. A robot's offset looks like a constant error of the detector; labels set by hand distinguish them, "
+            "and for the base the end of the shaft.",
         }  # fmt: skip
         if improved and self.learns:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})

@@ -14,7 +14,8 @@ import pytest
 from lib.adapt import RefusalError, adapt, judging, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.calibration.offsets import Unsettled, tool_axes
+from lib.adapt.shaft import ShaftEnd
+from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.correspondences import DataError
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
@@ -665,11 +666,15 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Detector, "load", lambda *_, **__: detector)
     monkeypatch.setattr(StandIn, "save", lambda self, path: path.write_bytes(b"weights"), raising=False)
     monkeypatch.setattr(report, "adapt", lambda *a, **k: adapt(*a, **k, progress=False, tune=tune))
+    pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
+    far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), 0.01, pictures, outline)
+    monkeypatch.setattr(loop, "shaft_end", lambda *_: far_off)
     out = tmp_path / "better"
     assert report.main([str(recording.folder), "--out", str(out), "--minutes", "1"]) == 0
     content = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png") == 1 and "too far from the label" in page and content["base_moved_mm"] == 0
     assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
     picture = base64.b64decode(re.search(r'data:image/jpeg;base64,([^"]+)', page)[1])
     assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (1040, 1046, 3)  # the tool, large
@@ -683,6 +688,26 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert "Left alone" in capsys.readouterr().out
     assert report.main([str(recording.folder), "--out", str(out)]) == 3
     assert "weights.safetensors in this folder is from an earlier run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_the_end_of_the_shaft_corrects_a_base_that_detector_and_robot_leave_open(world, tmp_path, monkeypatch, shown):
+    """The robot's landmarks are 0.15 mm off, in all directions, and the detector is as unsure of the base."""
+    offset_mm = np.array([[-0.15, 0.1, -0.1], [0.1, 0.1, -0.1], [0.1, -0.1, 0.1]])
+
+    def robot(time_s, x):
+        return x + np.einsum("mij,kj->mki", carried(tool_axes(x), x, time_s), offset_mm)
+
+    recording = world.record(tmp_path / "lab", robot=robot)
+    pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
+    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], 0.01, pictures, outline)
+    monkeypatch.setattr(loop, "shaft_end", lambda *_: end if shown else None)
+    found = adapt(recording, StandIn(world.u, noise_px=0.7), folder=tmp_path, progress=False, tune=pupil(world))
+    exact = world.u[found.frames["judge"]]
+    along = exact[:, :, 1:].mean(axis=2) - exact[:, :, 0]
+    off = np.nanmedian(((found.told - exact)[:, :, 0] * along).sum(axis=-1) / (along**2).sum(axis=-1))
+    assert abs(off) < 0.008 if shown else abs(off) > 0.012
+    assert (found.shaft is end) == shown and (found.report["base_moved_mm"] > 0) == shown
 
 
 def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
