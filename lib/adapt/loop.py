@@ -14,12 +14,12 @@ import numpy as np
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.shaft import ShaftEnd, shaft_end
 from lib.adapt.teacher import LABEL, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording, read_image, smoothed
 from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
@@ -295,7 +295,8 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         if by_hand is None:  # else the labels tell where the base is
-            self.shaft = shaft_end(recording, learn, u, teacher.sine(learn))
+            sine = tilt(recording.landmarks_mm()[learn], teacher.calibration.cameras)
+            self.shaft = shaft_end(recording, learn, u, sine)
             moved, teacher = teacher, teacher.with_base(self.shaft)
             self.report["base_moved_mm"] = float(teacher.offset_mm[0, 0] - moved.offset_mm[0, 0])
         self.report["refused_frames"] = teacher.refused

@@ -4,15 +4,14 @@ import argparse
 import shlex
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import files, paths
 from lib.adapt.loop import Adaptation, adapt, adapt_images
-from lib.adapt.shaft import ShaftEnd
 from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.shaft import outlined
 from lib.landmarks.windows import cut, map_points, tool_pose, window_from_image
 from lib.recordings import Recording, StereoFrame
 from lib.trust.check import data_uri, overlay
@@ -65,16 +64,6 @@ def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
         caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above: before. Below: after."
         pictures.append((caption, data_uri(np.vstack(rows), ".jpg")))
     return pictures
-
-
-def outlined(end: ShaftEnd, zoom: int = 3) -> np.ndarray:
-    """The aligned pictures of left and right side by side, with the fitted outline of the shaft's end; RGB."""
-    pictures = []
-    for picture, outline in zip(end.pictures, end.outline, strict=True):
-        large = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
-        points = np.rint(zoom * (outline + 0.5) - 0.5).astype(np.int32)
-        pictures.append(cv2.polylines(large, [points], False, (0, 255, 0), 1, cv2.LINE_AA))
-    return np.hstack(pictures)
 
 
 def main(argv: list[str]) -> int:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lib.adapt.looking import Seen
-from lib.adapt.shaft import ShaftEnd
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
@@ -22,6 +21,7 @@ from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
@@ -150,13 +150,6 @@ class Teacher:
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
         return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
-
-    def sine(self, frames: np.ndarray) -> np.ndarray:
-        """Sine (m, 2) of the angle between tool and image, positive if it points away from the camera; NaN without report."""
-        x = self.recording.landmarks_mm()[frames]
-        along = x[:, 1:].mean(axis=1) - x[:, 0]
-        views = np.stack([camera.viewing_direction for camera in self.calibration.cameras], axis=1)
-        return along @ views / np.linalg.norm(along, axis=1, keepdims=True)
 
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
         """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.

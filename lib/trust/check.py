@@ -14,6 +14,7 @@ from lib import files, paths
 from lib.calibration.timing import clock_error
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
+from lib.landmarks.shaft import outlined
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame, encoded
 from lib.trust.health import spread
@@ -54,6 +55,7 @@ class Check:
             vars(self), verdict=a.verdict, overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
             report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
             hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
+            shaft=None if a.shaft is None else data_uri(outlined(a.shaft), ".png"),
         )  # fmt: skip
         files.write_text(folder / "check.html", text)
         return folder / "check.html"

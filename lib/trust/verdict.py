@@ -12,8 +12,10 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from lib import paths
 from lib.calibration import Calibration, CompetingCamerasError, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.calibration.checks import extents
+from lib.calibration.offsets import with_offsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
+from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
 from lib.trust.health import Health, feature_matches, health, spread
@@ -56,6 +58,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "epipolar": (1.5, 4.0),
     # Share of bad landmarks (`Health.unhealthy`).  10 % of gross errors in each image give 0.2.
     "health": (0.25, 0.5),
+    # Distance of the detected base from the end of the shaft, as a share of the tool's length, less its standard deviation.
+    # On tools that the detector knows it is up to 0.007.
+    "base": (0.02, np.inf),
     # Share of the residuals' variance that a named fault explains.
     "diagnosis": (0.0, 0.5),
 }  # fmt: skip
@@ -64,6 +69,7 @@ _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
 #: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
+_SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
@@ -125,6 +131,7 @@ def judge(
     data: Correspondences | None, calibration: Calibration | None, *, diagnosis: Diagnosis | None = None,
     health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float = 0.010,
     error: Exception | None = None, doubts: Sequence[Doubt] = (), epipolar_at_mm: np.ndarray | None = None,
+    shaft: ShaftEnd | None = None,
 ) -> Verdict:  # fmt: skip
     """The verdict on a calibration, from its own numbers and from independent evidence; arguments that are None are skipped.
 
@@ -135,6 +142,7 @@ def judge(
         epipolar_at_mm: (k, 3) positions of these features by the calibration; None assumes that they are near the tool.
         robot_accuracy_mm: Standard deviation of the robot's position per coordinate, as the manufacturer states it.
         doubts: The doubts of the recording (`lib.recordings.Recording.doubts`).
+        shaft: Where the shaft ends in the aligned images, measured from the detected base.
     """
     found: list[Reason] = []
     best = None if diagnosis is None else diagnosis.best
@@ -169,6 +177,11 @@ def judge(
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
+    if shaft is not None:
+        side = "behind" if shaft.moved > 0 else "beyond"
+        text = f"The detector marks the base {100 * abs(shaft.moved):.1f} % of the tool's length {side} the end of the shaft."
+        cure = f"It may not know this tool. {_OVERLAYS}, then {TRAIN_FURTHER}."
+        found += _reason("base", abs(shaft.moved) - shaft.sd, text, cure)
     found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]
     return Verdict.join([Verdict(tuple(found))])
 
@@ -275,7 +288,8 @@ def _noise_px2(c: Calibration) -> np.ndarray:
 class Assessment:
     """The result of `assess`; `calibration` is None if it was refused, and the verdict says why.
 
-    `epipolar_px` is the median epipolar distance of features that both images show; NaN if there are too few.
+    `epipolar_px` is the median epipolar distance of features that both images show; NaN if there are too few.  `shaft` is the
+    end of the shaft as the images show it; None if they do not show it clearly, or without a detector.
     """
 
     data: Correspondences
@@ -284,6 +298,7 @@ class Assessment:
     diagnosis: Diagnosis
     health: Health
     epipolar_px: float = np.nan
+    shaft: ShaftEnd | None = None
 
 
 def assess(
@@ -335,9 +350,10 @@ def assess(
             jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
             diagnosis = Diagnosis((jumped, *others))
     found = health(recording, data, calibration, detector=detector)
+    shaft = None if detector is None or calibration is None else _shaft(recording, data, calibration)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
-        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm,
+        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
@@ -346,7 +362,18 @@ def assess(
         by_labels = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
-    return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px)
+    return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
+
+
+def _shaft(recording: Recording, data: Correspondences, calibration: Calibration) -> ShaftEnd | None:
+    """The end of the shaft, in frames that are aligned where the detector sees the landmarks on average."""
+    frames = np.unique(data.frame)
+    frames = frames[spread(len(frames), _SHAFT_FRAMES)]
+    if recording.skeleton != LANDMARKS or calibration.rig is None:
+        return None
+    x = with_offsets(data, calibration.offsets).of_frames(frames).grid("x_mm")
+    u = np.stack(calibration.pair.project(x.reshape(-1, 3)), axis=1).reshape(len(frames), 3, 2, 2).swapaxes(1, 2)
+    return shaft_end(recording, frames, u, tilt(x, calibration.cameras))
 
 
 def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:

@@ -14,11 +14,11 @@ import pytest
 from lib.adapt import RefusalError, adapt, judging, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.shaft import ShaftEnd
 from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.correspondences import DataError
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Kinematics
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
@@ -667,7 +667,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(StandIn, "save", lambda self, path: path.write_bytes(b"weights"), raising=False)
     monkeypatch.setattr(report, "adapt", lambda *a, **k: adapt(*a, **k, progress=False, tune=tune))
     pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
-    far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), 0.01, pictures, outline)
+    far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), 5.0, 0.01, pictures, outline)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: far_off)
     out = tmp_path / "better"
     assert report.main([str(recording.folder), "--out", str(out), "--minutes", "1"]) == 0
@@ -700,7 +700,7 @@ def test_the_end_of_the_shaft_corrects_a_base_that_detector_and_robot_leave_open
 
     recording = world.record(tmp_path / "lab", robot=robot)
     pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
-    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], 0.01, pictures, outline)
+    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], 0.01, 0.01, pictures, outline)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: end if shown else None)
     found = adapt(recording, StandIn(world.u, noise_px=0.7), folder=tmp_path, progress=False, tune=pupil(world))
     exact = world.u[found.frames["judge"]]

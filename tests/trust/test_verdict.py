@@ -11,6 +11,7 @@ import pytest
 from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
+from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Doubt, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import LEVELS, Health, Reason, Verdict, assess, diagnose, judge
@@ -134,6 +135,8 @@ def test_witnesses_count():
     bad = Health(np.arange(20), {"looks": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
     assert names(data, health=bad) == {"detector_unfit": LEVELS[2]}
     assert names(data, doubts=[Doubt("log_gap", "An hour.", "Look.")]) == {"log_gap": LEVELS[1]}
+    end = [ShaftEnd(np.arange(3), np.zeros((3, 2, 2)), moved, 0.01, None, None) for moved in (-0.05, 0.025, 0.05)]
+    assert [names(data, shaft=one) for one in end] == [{"base": LEVELS[1]}, {}, {"base": LEVELS[1]}]
 
 
 def test_a_refusal_names_its_own_cure():
@@ -167,6 +170,27 @@ def test_careless_labels_are_looked_at_again_and_no_detector_is_taught(decoded_o
     assert set(map(int, named.split(", "))) <= set(wild.tolist())
     blind = assess(recording, of_recording(recording, *(u * np.nan))).verdict  # of a detector that finds nothing
     assert not any("Look again at the labels" in reason.cure for reason in blind.reasons)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.08])
+def test_a_base_that_the_detector_marks_along_the_shaft_is_told(decoded_once, monkeypatch, off):
+    """Cameras with offsets explain it, and both images agree; only the images of the tool show it."""
+
+    def healthy(recording, data, *rest, **more):
+        frame = np.unique(data.frame)
+        return Health(frame, {"looks": np.zeros((len(frame), 3))}, np.ones((len(frame), 3), bool))
+
+    monkeypatch.setattr(verdicts, "health", healthy)
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    u = np.stack([recording.truth.u_left, recording.truth.u_right])
+    u[:, :, 0] += off * (u[:, :, 0] - u[:, :, 1:].mean(axis=2))
+    u += np.random.default_rng(2).normal(0, 0.7, u.shape)
+    data = of_recording(recording, *u, covariance_px2=np.tile(0.5 * np.eye(2), (len(recording), 3, 2, 1, 1)))
+    found = assess(recording, data, detector=lambda images: None).verdict
+    named = {reason.name: reason.text for reason in found.reasons}
+    assert ("base" in named) == (off > 0)
+    if off:
+        assert 7.0 < float(re.search(r"marks the base ([\d.]+) % .* behind the end", named["base"])[1]) < 9.0
 
 
 def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(monkeypatch):

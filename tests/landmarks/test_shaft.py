@@ -9,7 +9,7 @@ import pytest
 
 from lib.adapt import teach
 from lib.adapt.looking import look
-from lib.adapt.shaft import ShaftEnd, shaft_end
+from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
 from lib.recordings import StereoFrame
 from tests.adapt.world import StandIn, World
 
@@ -83,7 +83,7 @@ def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edg
     axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
 
     def moved(share, sd):
-        end = ShaftEnd(frames, u[:, :, 0] + share * axis, sd, np.empty(0), np.empty(0))
+        end = ShaftEnd(frames, u[:, :, 0] + share * axis, share, sd, np.empty(0), np.empty(0))
         found = teacher.with_base(end)
         off = found.labels(frames)[0] - u
         assert np.nanmax(np.abs(off[:, :, 1:])) < 1e-9  # the tips stay
@@ -108,5 +108,6 @@ def test_the_angle_between_tool_and_image_is_that_of_the_projection(tmp_path):
     size_px = np.linalg.norm(world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0], axis=-1)
     cosine = size_px / size_mm[:, None] / 25.0  # the rig has 25 pixels a millimetre
     known = np.isfinite(size_mm)
-    assert np.abs(np.sqrt(1 - teacher.sine(frames) ** 2) - cosine)[known].max() < 0.05
-    assert (teacher.sine(frames)[known] > 0).mean() > 0.9  # the shaft enters from the side of the microscope
+    sine = tilt(x, teacher.calibration.cameras)[known]
+    assert np.abs(np.sqrt(1 - sine**2) - cosine[known]).max() < 0.05
+    assert (sine > 0).mean() > 0.9  # the shaft enters from the side of the microscope

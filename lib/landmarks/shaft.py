@@ -1,17 +1,19 @@
-"""Where the shaft ends, in pictures that the robot aligns.
+"""Where the shaft ends, in images that the robot aligns.
 
 The base has no edge of its own, so a detector that does not know a tool marks it too far along the shaft, in all frames by
-the same distance.  But the base is where the jaws leave the shaft, on its axis, and that can be measured.  The robot's labels
-align the frames; in their mean the tool stays and the ground fades.  The shaft is a cylinder that ends flat.  Its end appears
-as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between shaft and
-image.  So the outline is two lines that touch the ellipse, and the half of the ellipse on the side of the tips.
+the same distance.  But the base is where the jaws leave the shaft, on its axis, and that can be measured.  The robot's
+landmarks align the frames; in their mean the tool stays and the ground fades.  The shaft is a cylinder that ends flat.  Its
+end appears as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between
+shaft and image.  So the outline is two lines that touch the ellipse, and the half of the ellipse on the side of the tips.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from lib.cameras import AffineCamera, NearAffineCamera
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.windows import cut, tool_pose, window_from_image
 from lib.recordings import Recording
@@ -43,16 +45,31 @@ class ShaftEnd(NamedTuple):
     Attributes:
         frame: Numbers (m,) of the frames.
         u: The base (m, 2, 2) px in both images; NaN where it is unknown.
-        sd: Standard deviation along the tool, as a share of its length.
+        moved, sd: Median shift from the given base towards the tips, and its standard deviation: shares of the tool's length.
         pictures: Mean of the aligned pictures (2, 141, 161, 3) uint8 of left and right.
         outline: Points (2, n, 2) px of the fitted outline in them.
     """
 
     frame: np.ndarray
     u: np.ndarray
+    moved: float
     sd: float
     pictures: np.ndarray
     outline: np.ndarray
+
+
+def tilt(x_mm: np.ndarray, cameras: Sequence[AffineCamera | NearAffineCamera]) -> np.ndarray:
+    """Sine (m, k) of the angle between the tool with landmarks x_mm (m, 3, 3) and the images of k cameras.
+
+    It is positive if the tool points away from the camera, and NaN where a landmark is unknown.
+
+    >>> tool = [[[0.0, 0.0, 0.0], [3.0, 1.0, 4.0], [3.0, -1.0, 4.0]]]
+    >>> tilt(np.array(tool), [AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])]).tolist()
+    [[0.8]]
+    """
+    along = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
+    views = np.stack([camera.viewing_direction for camera in cameras], axis=1)
+    return along @ views / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.ndarray) -> ShaftEnd | None:
@@ -60,8 +77,8 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
 
     Args:
         frames: Numbers (m,) of the frames.
-        u: Labels (m, 2, 3, 2) px of base and tips in them, of which the base may be off along the tool.
-        sine: Of the angle between tool and image (m, 2), positive if the tool points away from the camera.
+        u: Base and tips (m, 2, 3, 2) px in them, of which the base may be off along the tool.
+        sine: Of the angle between tool and image (m, 2), by `tilt`.
     """
     aligned = [_aligned(recording, frames, u[:, side], side) for side in (0, 1)]
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
@@ -97,7 +114,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
         outlines.append(np.concatenate([low[::-1], ellipse[0], high]) + [along, across] + (np.array(_SIZE_PX) - 1) / 2)
     found = u[:, :, 0] + along / _LENGTH_PX * axis
     sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(np.linalg.norm(axis, axis=-1))))
-    return ShaftEnd(frames, found, sd, np.stack(means).round().astype(np.uint8), np.stack(outlines))
+    return ShaftEnd(frames, found, along / _LENGTH_PX, sd, np.stack(means).round().astype(np.uint8), np.stack(outlines))
 
 
 def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -147,3 +164,13 @@ def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
             lines = [clear(x0 - straight, y0 + sign * side, np.array([0.0, 1.0])) for sign in (-1, 1)]
             found[i, j] = 0.6 * end + 0.2 * sum(lines)
     return found
+
+
+def outlined(end: ShaftEnd, zoom: int = 3) -> np.ndarray:
+    """The aligned pictures of left and right side by side, with the fitted outline of the shaft's end; RGB."""
+    pictures = []
+    for picture, outline in zip(end.pictures, end.outline, strict=True):
+        large = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        points = np.rint(zoom * (outline + 0.5) - 0.5).astype(np.int32)
+        pictures.append(cv2.polylines(large, [points], False, (0, 255, 0), 1, cv2.LINE_AA))
+    return np.hstack(pictures)
