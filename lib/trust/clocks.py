@@ -30,8 +30,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         ("clock", (0, 1), misfit.sum(axis=1)), ("camera_clock", (0,), misfit[:, 0] + misfit[now, 1]),
         ("camera_clock", (1,), misfit[:, 1] + misfit[now, 0]),
     ):  # fmt: skip
-        fitted = _refined(case, float(trial[np.argmin(score)]), views)
-        if fitted is None:
+        if (fitted := _refined(case, float(trial[np.argmin(score)]), views)) is None:
             continue
         fit, problem, (value,), (sd,) = fitted
         size = f"{1e3 * value:z.1f} +- {1e3 * sd:.1f} ms"
@@ -49,18 +48,17 @@ def _refined(
     case: Case, shift: float, views: tuple[int, ...], rate: float | None = None
 ) -> tuple[Robust, Problem, np.ndarray, np.ndarray] | None:
     """Refine the clock's shift (and rate - 1) by Gauss-Newton: the fit, its rows, the values, their standard deviations."""
-    time, views = case.problem.time - np.median(case.problem.time), list(views)
+    time = case.problem.time - np.median(case.problem.time)
     powers = np.ones((1, len(time))) if rate is None else np.stack([np.ones(len(time)), time])
     value, start = np.array([shift] if rate is None else [shift, rate - 1.0]), None
     for _ in range(6):
         later = value @ powers
-        x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
-        x[:, views] = case.moved(later)[:, None]
-        velocity[:, views] = case.velocity(later)[:, None]
-        problem = replace(case.problem, x=np.where(np.isfinite(velocity), x, np.nan))
+        velocity = case.velocity(later)
+        problem = case.problem.moved_to(np.where(np.isfinite(velocity), case.moved(later), np.nan), views)
         if problem.used.all(axis=1).sum() < 6:
             return None
-        fit = problem.fit(lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=start)
+        v = velocity[:, None] * np.isin((0, 1), views)[:, None]
+        fit = problem.fit(lambda M, v=v: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=start)
         start, sd = fit.start, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
@@ -141,9 +139,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
     for first, views in product((0, 1), ((0, 1), (0,), (1,))):
         order = np.array(sorted(range(number[-1] + 1), key=lambda i, first=first: str(i + first)))[number]
         later = (np.interp(order, number, starts) - starts)[case.problem.frame]
-        x = case.problem.x.copy()
-        x[:, list(views)] = case.moved(later)[:, None]
-        moved = replace(case.problem, x=x)
+        moved = case.problem.moved_to(case.moved(later), views)
         if (order == number).all() or moved.used.all(axis=1).sum() < 6:
             continue
         fit = moved.fit(worth=case.null.total - HOPELESS)

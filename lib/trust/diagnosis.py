@@ -51,9 +51,8 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     table = case.by_frame(problem.x[:, 0])
     others = [(order, (0, 1)) for order in permutations(range(3)) if order != (0, 1, 2)]
     for order, views in (*others, ((0, 2, 1), (0,)), ((0, 2, 1), (1,))):
-        x = problem.x.copy()
-        x[:, list(views)] = table[problem.frame, np.array(order)[problem.landmark]][:, None]
-        if (moved := replace(problem, x=x)).used.all(axis=1).sum() < 6:
+        moved = problem.moved_to(table[problem.frame, np.array(order)[problem.landmark]], views)
+        if moved.used.all(axis=1).sum() < 6:
             continue
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
@@ -279,9 +278,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
             continue
         # Each image belongs to the instant at which it was first seen.
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
-        first = problem.x.copy()
-        first[:, views] = x[source, np.minimum(problem.landmark, 2)][:, None]
-        fit = replace(problem, x=first).fit(start=case.null.start)
+        fit = problem.moved_to(x[source, np.minimum(problem.landmark, 2)], views).fit(start=case.null.start)
         who = "" if len(views) == 2 else f" of the {SIDES[views[0]]} image"
         text = f"the detections{who} repeat those of the frame before while the robot moves"
         cure = "Drop images that the camera delivered twice, and give the others their own times in frames.csv."

@@ -5,7 +5,7 @@ that a fault shows even if 30 % of the landmarks are wrong.  All fits include co
 axes and a finite working distance, both with a prior, because every microscope has these, whatever else is wrong.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -139,6 +139,12 @@ class Problem:
     def used(self) -> np.ndarray:
         """(n, 2) bool: the image shows the landmark and the robot reports it."""
         return self.seen & np.isfinite(self.x).all(axis=2)
+
+    def moved_to(self, x: np.ndarray, views: Sequence[int]) -> Self:
+        """The same rows with the robot at positions x (n, 3) mm, for the images of `views`."""
+        positions = self.x.copy()
+        positions[:, list(views)] = x[:, None]
+        return replace(self, x=positions)
 
     def claimed_px(self, rows: np.ndarray | slice = slice(None)) -> float:
         """Median distance error of some rows, px, as the detector states it; 0 if it states none."""
@@ -374,9 +380,7 @@ class Case:
             before, own = own, np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
             if (own == before).all():
                 break
-            positions = problem.x.copy()
-            positions[:, views] = x[own[problem.frame], np.arange(len(problem))][:, None]
-            moved = replace(problem, x=positions)
+            moved = problem.moved_to(x[own[problem.frame], np.arange(len(problem))], views)
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 
