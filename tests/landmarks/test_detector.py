@@ -70,8 +70,9 @@ def test_save_and_load(images, tmp_path):
     detector = untrained()
     detector.save(tmp_path / "weights.safetensors")
     loaded = Detector.load(tmp_path / "weights.safetensors", engine="torch")
+    found, before = loaded(images), detector(images)
     for name in ("u", "covariance", "confidence"):
-        assert np.array_equal(getattr(loaded(images), name), getattr(detector(images), name), equal_nan=True)
+        assert np.array_equal(getattr(found, name), getattr(before, name), equal_nan=True)
 
 
 def test_missing_is_nan_with_confidence_zero(images):
