@@ -106,7 +106,7 @@ class Forceps:
 
     def landmarks(self, pose: Pose) -> np.ndarray:
         """Positions (3, 3) mm of base, tip_1 and tip_2 in the microscope frame."""
-        return pose.place(np.array([np.zeros(3), *(self._jaw(side, pose.opening_mm)[2] for side in (+1, -1))]))
+        return pose.place(self._jaw(+1, pose.opening_mm)[2] * [[0, 0, 0], [1, 1, 1], [1, -1, 1]])  # mirror images
 
     def nodes(self, pose: Pose) -> Nodes:
         """The tool as chains of round cones: 0 is the shaft (far end first), 1 and 2 the jaws."""
