@@ -21,8 +21,9 @@ from lib.recordings.annotations import inside
 
 #: The aligned pictures (width, height), and the tool's length in them; half of the width is the search's reach and the shaft.
 _SIZE_PX, _LENGTH_PX = (161, 141), 200
-#: Searched positions of the shaft's end along the tool, radii, and positions across, in pixels of the aligned pictures.
-_ALONG_PX, _RADII_PX, _ACROSS_PX = np.arange(-36, 37), np.arange(2.0, 46.0), np.arange(-4.0, 5.0, 2.0)
+#: Searched positions of the shaft's end along the tool and across, and its radii, in pixels of the aligned pictures.
+_ALONG_PX, _ACROSS_PX = np.arange(-36, 37), np.array([-3.0, 0.0, 3.0])
+_RADII_PX = np.concatenate([np.arange(2.0, 20.0), np.arange(20.0, 47.0, 2.0)])
 #: Directions from the base to the points of the half ellipse, and number of points of each straight line.
 _DIRECTIONS_RAD, _STRAIGHT = np.radians(np.linspace(-70, 70, 15)), 10
 #: Groups of consecutive frames with a mean picture each, for each image; and fewest pictures of a group.
@@ -33,7 +34,7 @@ _OTHER_EDGES = 0.6
 _LARGE = 0.75
 #: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  It
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
-_AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.22
+_AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: four recordings by other renderers and on validation recordings.
 _SD, _SD_PX = 0.01, 1.0
@@ -148,11 +149,14 @@ def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
     if not level.all():
         return found
 
+    gradient = np.stack([gx, gy]).reshape(2, -1, gx.shape[-1])
+
     def clear(x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Gradients across the outline less those along it, in terms of all: their mean over points and pictures."""
         column, row = np.rint(x).astype(int).clip(0, w - 1), np.rint(y).astype(int).clip(0, h - 1)
-        dx, dy, (nx, ny) = gx[g, row, column], gy[g, row, column], np.moveaxis(normal[..., None], -2, 0)
-        across, along = (np.linalg.norm(part, axis=-1) for part in (dx * nx + dy * ny, dx * ny - dy * nx))
+        dx, dy = gradient[:, (g * h + row) * w + column]
+        nx, ny = np.moveaxis(normal.astype(np.float32)[..., None], -2, 0)
+        across, along = (np.sqrt(np.einsum("...i,...i", part, part)) for part in (dx * nx + dy * ny, dx * ny - dy * nx))
         return ((across - _OTHER_EDGES * along) / (across + along + level)).mean(axis=(-2, -1))
 
     for i, radius in enumerate(_RADII_PX):

@@ -13,13 +13,13 @@ from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
 from lib.recordings import StereoFrame
 from tests.adapt.world import StandIn, World
 
-SIZE, FRAMES, LENGTH_PX = (480, 270), np.arange(16), 90.0
+SIZE, FRAMES, LENGTH_PX = (360, 200), np.arange(12), 90.0
 
 
 def tools(sine):
-    """Landmarks (16, 2, 3, 2) px of a tool that wanders and turns."""
+    """Landmarks (12, 2, 3, 2) px of a tool that wanders and turns."""
     rng = np.random.default_rng(0)
-    base = rng.uniform((170, 100), (250, 170), (len(FRAMES), 2, 2))
+    base = rng.uniform((120, 70), (170, 120), (len(FRAMES), 2, 2))
     angle = rng.normal(0.3, 0.2, (len(FRAMES), 1, 1)) + np.radians([0, 18, -18])
     length = LENGTH_PX * np.sqrt(1 - sine**2) / np.cos(np.radians(18)) * np.array([0, 1, 1])
     return base[:, :, None] + length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
