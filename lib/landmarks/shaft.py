@@ -81,7 +81,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
         u: Base and tips (m, 2, 3, 2) px in them, of which the base may be off along the tool.
         sine: Of the angle between tool and image (m, 2), by `tilt`.
     """
-    aligned = [_aligned(recording, frames, u[:, side], side) for side in (0, 1)]
+    aligned = _aligned(recording, frames, u)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
     means, scores, sines = [], [], []
@@ -118,15 +118,19 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
     return ShaftEnd(frames, found, along / _LENGTH_PX, sd, np.stack(means).round().astype(np.uint8), np.stack(outlines))
 
 
-def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures (k, h, w, 3) around the base, in which the tool points right, and which of the frames they show."""
-    kept = np.flatnonzero(np.isfinite(u).all(axis=(1, 2)) & inside(u, recording.image_size_px)[:, 0])
-    found, angle, zoom = [], tool_pose(u)[1], _LENGTH_PX / tool_length_px(u)
-    for k in kept:
-        frame = recording.frames[int(frames[k])]
-        matrix = window_from_image(u[k, 0], angle[k], _SIZE_PX, zoom[k])
-        found.append(cut((frame.left, frame.right)[side], matrix, _SIZE_PX, border=cv2.BORDER_REPLICATE))
-    return np.array(found, np.float32).reshape(len(kept), *_SIZE_PX[::-1], 3), kept
+def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each image, pictures (k, h, w, 3) around the base, in which the tool points right, and which frames they show."""
+    shown = np.isfinite(u).all(axis=(2, 3)) & inside(u, recording.image_size_px)[:, :, 0]
+    found: tuple[list[np.ndarray], ...] = ([], [])
+    for k in np.flatnonzero(shown.any(axis=1)):
+        frame, angle, zoom = recording.frames[int(frames[k])], tool_pose(u[k])[1], _LENGTH_PX / tool_length_px(u[k])
+        for side in np.flatnonzero(shown[k]):
+            matrix = window_from_image(u[k, side, 0], angle[side], _SIZE_PX, zoom[side])
+            found[side].append(cut((frame.left, frame.right)[side], matrix, _SIZE_PX, border=cv2.BORDER_REPLICATE))
+    return [
+        (np.array(pictures, np.float32).reshape(-1, *_SIZE_PX[::-1], 3), np.flatnonzero(shown[:, side]))
+        for side, pictures in enumerate(found)
+    ]
 
 
 def _outline(radius: float, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
