@@ -4,7 +4,7 @@ The base has no edge of its own, so a detector that does not know a tool marks i
 the same distance.  But the base is where the jaws leave the shaft, on its axis, and that can be measured.  The robot's
 landmarks align the frames; in their mean the tool stays and the ground fades.  The shaft is a cylinder that ends flat.  Its
 end appears as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between
-shaft and image.  So the outline is two lines that touch the ellipse, and the half of the ellipse on the side of the tips.
+shaft and image.  So the outline is two lines, parallel or tapered, and the half of the ellipse on the side of the tips.
 """
 
 from collections.abc import Sequence
@@ -24,6 +24,8 @@ _SIZE_PX, _LENGTH_PX = (161, 141), 200
 #: Searched positions of the shaft's end along the tool and across, and its radii, in pixels of the aligned pictures.
 _ALONG_PX, _ACROSS_PX = np.arange(-36, 37), np.array([-3.0, 0.0, 3.0])
 _RADII_PX = np.concatenate([np.arange(2.0, 20.0), np.arange(20.0, 47.0, 2.0)])
+#: Slopes of the shaft's sides in its last pixels; a tapered shaft is only searched on the axis.
+_SLOPES, _TAPER_PX = (0.0, 0.2, 0.45), 12.0
 #: Directions from the base to the points of the half ellipse, and number of points of each straight line.
 _DIRECTIONS_RAD, _STRAIGHT = np.radians(np.linspace(-70, 70, 15)), 10
 #: Groups of consecutive frames with a mean picture each, for each image; and fewest pictures of a group.
@@ -37,7 +39,7 @@ _LARGE = 0.75
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: four recordings by other renderers and on validation recordings.
-_SD, _SD_PX = 0.01, 1.0
+_SD, _SD_PX = 0.011, 1.0
 
 
 class ShaftEnd(NamedTuple):
@@ -92,15 +94,16 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
         sines.append(np.abs([sine[kept[group], side].mean() for group in groups]).clip(0, 0.9))
         scores.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
         means.append(pictures.mean(axis=0))
-    if not all(np.isfinite(score).all() for score in scores):  # pictures without any edge
-        return None
-    total = np.mean([score.max(axis=1) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
+    every = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
+    total = every.max(axis=0)
     clear = total.max(axis=0)
     peaks = np.flatnonzero((clear[1:-1] >= clear[:-2]) & (clear[1:-1] > clear[2:])) + 1
     peaks = peaks[clear[peaks] > _AS_CLEAR * clear.max()]
     if not len(peaks) or clear[peaks[-1]] < _CLEAR * np.median(clear):
         return None
     i, k = peaks[-1], total[:, peaks[-1]].argmax()
+    slope = every[:, k, i].argmax()
+    scores = [score[slope] for score in scores]
     best = [score[k, :, i].argmax() for score in scores]  # the positions across
     if k == len(_RADII_PX) - 1 or np.mean([score[k, j, i] for score, j in zip(scores, best, strict=True)]) < _LEAST:
         return None
@@ -111,7 +114,8 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
     outlines = []
     for across, own in zip(_ACROSS_PX[best], sines, strict=True):
         ellipse, _, straight = _outline(radius, own.mean()[None])
-        low, high = ([[-back, side * radius / np.sqrt(1 - own.mean() ** 2)] for back in straight] for side in (-1, 1))
+        half = radius / np.sqrt(1 - own.mean() ** 2) + _SLOPES[slope] * np.minimum(straight, _TAPER_PX)
+        low, high = (np.stack([-straight, side * half], axis=1) for side in (-1, 1))
         outlines.append(np.concatenate([low[::-1], ellipse[0], high]) + [along, across] + (np.array(_SIZE_PX) - 1) / 2)
     found = u[:, :, 0] + along / _LENGTH_PX * axis
     sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(np.linalg.norm(axis, axis=-1))))
@@ -144,13 +148,13 @@ def _outline(radius: float, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (radii, positions across, positions along)."""
+    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (slopes, radii, positions across and along)."""
     smooth = [cv2.GaussianBlur(picture, (0, 0), 1.2) for picture in pictures]
     gx, gy = (np.stack([cv2.Sobel(one, cv2.CV_32F, *order) for one in smooth]) for order in ((1, 0), (0, 1)))
     level = np.quantile(np.hypot(gx, gy).max(axis=-1).reshape(len(pictures), -1), 0.9, axis=1)[:, None]
     g, (w, h), middle = np.arange(len(pictures))[:, None], _SIZE_PX, (np.array(_SIZE_PX) - 1) / 2
-    found = np.full((len(_RADII_PX), len(_ACROSS_PX), len(_ALONG_PX)), np.nan)
-    if not level.all():
+    found = np.full((len(_SLOPES), len(_RADII_PX), len(_ACROSS_PX), len(_ALONG_PX)), -1.0)  # less than any score
+    if not level.all():  # pictures without any edge
         return found
 
     gradient = np.stack([gx, gy]).reshape(2, -1, gx.shape[-1])
@@ -169,8 +173,13 @@ def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
         for j, across in enumerate(_ACROSS_PX):
             x0, y0 = middle[0] + _ALONG_PX[:, None, None], middle[1] + across
             end = clear(x0 + ellipse[..., 0], y0 + ellipse[..., 1], normal)
-            lines = [clear(x0 - straight, y0 + sign * side, np.array([0.0, 1.0])) for sign in (-1, 1)]
-            found[i, j] = 0.6 * end + 0.2 * sum(lines)
+            for k, slope in enumerate(_SLOPES if across == 0 else _SLOPES[:1]):
+                back = np.minimum(straight, _TAPER_PX) if slope else straight
+                lines = [
+                    clear(x0 - back, y0 + sign * (side + slope * back), np.array([slope, sign]) / np.hypot(slope, 1))
+                    for sign in (-1, 1)
+                ]
+                found[k, i, j] = 0.6 * end + 0.2 * sum(lines)
     return found
 
 

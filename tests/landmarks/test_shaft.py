@@ -25,7 +25,7 @@ def tools(sine):
     return base[:, :, None] + length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def pictured(u, sine, *, radius_px=12.0, shaft=True, jaws=True):
+def pictured(u, sine, *, radius_px=12.0, taper=0.0, shaft=True, jaws=True):
     """A recording of drawn tools, whose shafts end at the base, on a ground that differs in every frame."""
     rng, pairs = np.random.default_rng(1), []
     for pair in u:
@@ -38,7 +38,10 @@ def pictured(u, sine, *, radius_px=12.0, shaft=True, jaws=True):
             across = np.array([-along[1], along[0]])
             turn = np.linspace(-np.pi / 2, np.pi / 2, 40)[:, None]
             end = radius_px * (sine * np.cos(turn) * along + np.sin(turn) * across)
-            outline = base + np.concatenate([end, end[::-1][:1] - 250 * along, end[:1] - 250 * along])
+            wide = taper * radius_px * across
+            behind = [end[-1] - 12 * along + wide, end[-1] - 250 * along + wide]
+            behind += [end[0] - 250 * along - wide, end[0] - 12 * along - wide]
+            outline = base + np.concatenate([end, behind])
             for tip in tips if jaws else ():
                 cv2.line(large, *(np.rint(4 * point).astype(int) for point in (base, tip)), 90.0, 16)
             if shaft:
@@ -49,13 +52,13 @@ def pictured(u, sine, *, radius_px=12.0, shaft=True, jaws=True):
     return SimpleNamespace(frames=pairs, image_size_px=SIZE)
 
 
-@pytest.mark.parametrize(("sine", "share"), [(0.5, 0.1), (0.2, -0.06)])
-def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_tool(sine, share):
+@pytest.mark.parametrize(("sine", "share", "taper"), [(0.5, 0.1, 0.0), (0.2, -0.06, 0.0), (0.4, 0.05, 0.4)])
+def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_tool(sine, share, taper):
     u = tools(sine)
     axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
     labels = u.copy()
     labels[:, :, 0] += share * axis
-    found = shaft_end(pictured(u, sine), FRAMES, labels, np.full((len(FRAMES), 2), sine))
+    found = shaft_end(pictured(u, sine, taper=taper), FRAMES, labels, np.full((len(FRAMES), 2), sine))
     length = np.linalg.norm(axis, axis=-1)
     assert (np.linalg.norm(found.u - u[:, :, 0], axis=-1) / length).max() < 0.012
     assert found.pictures.shape == (2, 141, 161, 3) and found.outline.shape[::2] == (2, 2)
