@@ -59,8 +59,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     # Share of bad landmarks (`Health.unhealthy`).  10 % of gross errors in each image give 0.2.
     "health": (0.25, 0.5),
     # Distance of the detected base from the end of the shaft, as a share of the tool's length, less its standard deviation.
-    # On tools that the detector knows it is up to 0.007.
-    "base": (0.02, np.inf),
+    # On tools that the detector knows it is up to 0.01, and twice that where the images show the end poorly.
+    "base": (0.025, np.inf),
     # Share of the residuals' variance that a named fault explains.
     "diagnosis": (0.0, 0.5),
 }  # fmt: skip
@@ -289,7 +289,7 @@ class Assessment:
     """The result of `assess`; `calibration` is None if it was refused, and the verdict says why.
 
     `epipolar_px` is the median epipolar distance of features that both images show; NaN if there are too few.  `shaft` is the
-    end of the shaft as the images show it; None if they do not show it clearly, or without a detector.
+    end of the shaft as the images show it; None if they do not show it clearly, without a detector, or if the robot errs.
     """
 
     data: Correspondences
@@ -350,7 +350,9 @@ def assess(
             jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
             diagnosis = Diagnosis((jumped, *others))
     found = health(recording, data, calibration, detector=detector)
-    shaft = None if detector is None or calibration is None else _shaft(recording, data, calibration)
+    shaft, best = None, diagnosis.best
+    if detector is not None and calibration is not None and (best is None or best.name in ("landmark_offset", *OF_DETECTOR)):
+        shaft = _shaft(recording, data, calibration)  # faults of the robot would blur the aligned images
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,

@@ -674,7 +674,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     content = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png") == 1 and "too far from the label" in page and content["base_moved_mm"] == 0
+    assert page.count("data:image/png") == 1 and "so the label stays" in page and content["base_moved_mm"] == 0
     assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
     picture = base64.b64decode(re.search(r'data:image/jpeg;base64,([^"]+)', page)[1])
     assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (1040, 1046, 3)  # the tool, large
