@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera
-from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.windows import cut, tool_pose, window_from_image
 from lib.recordings import Recording
 from lib.recordings.annotations import inside
 
-#: The aligned pictures (width, height), and the tool's length in them; half of the width is the search's reach and the shaft.
+#: Size of the aligned pictures (width, height), and distance from the base to the middle of the tips in them.
 _SIZE_PX, _LENGTH_PX = (161, 141), 200
+_MIDDLE_PX = (np.array(_SIZE_PX) - 1) / 2
 #: Searched positions of the shaft's end along the tool and across, and its radii, in pixels of the aligned pictures.
-_ALONG_PX, _ACROSS_PX = np.arange(-36, 37), np.array([-3.0, 0.0, 3.0])
+_ALONG_PX, _ACROSS_PX = np.arange(-31, 32), np.array([-3.0, 0.0, 3.0])
 _RADII_PX = np.concatenate([np.arange(2.0, 20.0), np.arange(20.0, 47.0, 2.0)])
 #: Slopes of the shaft's sides in its last pixels; a tapered shaft is only searched on the axis.
 _SLOPES, _TAPER_PX = (0.0, 0.2, 0.45), 12.0
@@ -32,13 +32,15 @@ _DIRECTIONS_RAD, _STRAIGHT = np.radians(np.linspace(-70, 70, 15)), 10
 _GROUPS, _FEWEST = 4, 3
 #: Weight of gradients along the outline, which belong to other edges, relative to those across it.
 _OTHER_EDGES = 0.6
+_END = 0.6  # weight of the half ellipse; the sides have the rest
+_STEEPEST = 0.9  # largest sine; a steeper shaft shows its end from above
 #: A longer outline explains more edges, so the mean score counts times this power of the radius.  A highlight is shorter.
 _LARGE = 0.75
 #: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  It
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
-#: four recordings by other renderers and on validation recordings.
+#: five recordings by other renderers and on validation recordings.
 _SD, _SD_PX = 0.011, 1.0
 
 
@@ -48,8 +50,8 @@ class ShaftEnd(NamedTuple):
     Attributes:
         frame: Numbers (m,) of the frames.
         u: The base (m, 2, 2) px in both images; NaN where it is unknown.
-        moved, sd: Median shift from the given base towards the tips, and its standard deviation: shares of the tool's length.
-        pictures: Mean of the aligned pictures (2, 141, 161, 3) uint8 of left and right.
+        moved, sd: Shift from the given base towards the tips, and its standard deviation: shares of the tool's length.
+        pictures: Means of the aligned pictures (2, 141, 161, 3) uint8 of left and right.
         outline: Points (2, n, 2) px of the fitted outline in them.
     """
 
@@ -86,40 +88,36 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
     aligned = _aligned(recording, frames, u)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
-    means, scores, sines = [], [], []
+    scores, sines = [], []
     for side, (pictures, kept) in enumerate(aligned):
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
         even = pictures - pictures.mean(axis=(1, 2), keepdims=True)
         even /= np.maximum(even.std(axis=(1, 2, 3), keepdims=True), 1.0)
-        sines.append(np.abs([sine[kept[group], side].mean() for group in groups]).clip(0, 0.9))
+        sines.append(np.abs([sine[kept[group], side].mean() for group in groups]).clip(0, _STEEPEST))
         scores.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
-        means.append(pictures.mean(axis=0))
-    every = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
-    total = every.max(axis=0)
-    clear = total.max(axis=0)
-    peaks = np.flatnonzero((clear[1:-1] >= clear[:-2]) & (clear[1:-1] > clear[2:])) + 1
-    peaks = peaks[clear[peaks] > _AS_CLEAR * clear.max()]
-    if not len(peaks) or clear[peaks[-1]] < _CLEAR * np.median(clear):
+    clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
+    best = clear.max(axis=(0, 1))
+    peaks = np.flatnonzero((best[1:-1] >= best[:-2]) & (best[1:-1] > best[2:])) + 1
+    peaks = peaks[best[peaks] > _AS_CLEAR * best.max()]
+    if not len(peaks) or best[peaks[-1]] < _CLEAR * np.median(best):
         return None
-    i, k = peaks[-1], total[:, peaks[-1]].argmax()
-    slope = every[:, k, i].argmax()
-    scores = [score[slope] for score in scores]
-    best = [score[k, :, i].argmax() for score in scores]  # the positions across
-    if k == len(_RADII_PX) - 1 or np.mean([score[k, j, i] for score, j in zip(scores, best, strict=True)]) < _LEAST:
+    i = peaks[-1]
+    slope, k = np.unravel_index(clear[:, :, i].argmax(), clear.shape[:2])
+    own = [score[slope, k, :, i] for score in scores]  # by the position across
+    if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST:
         return None
-    radius = _RADII_PX[k]
-    before, at, after = clear[i - 1 : i + 2]
+    before, at, after = best[i - 1 : i + 2]
     along = _ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)
-    axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
     outlines = []
-    for across, own in zip(_ACROSS_PX[best], sines, strict=True):
-        ellipse, _, straight = _outline(radius, own.mean()[None])
-        half = radius / np.sqrt(1 - own.mean() ** 2) + _SLOPES[slope] * np.minimum(straight, _TAPER_PX)
-        low, high = (np.stack([-straight, side * half], axis=1) for side in (-1, 1))
-        outlines.append(np.concatenate([low[::-1], ellipse[0], high]) + [along, across] + (np.array(_SIZE_PX) - 1) / 2)
-    found = u[:, :, 0] + along / _LENGTH_PX * axis
+    for score, angle in zip(own, sines, strict=True):
+        mean = angle.mean(keepdims=True)
+        low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
+        points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
+        outlines.append(points + _MIDDLE_PX + [along, _ACROSS_PX[score.argmax()]])
+    axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
     sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(np.linalg.norm(axis, axis=-1))))
-    return ShaftEnd(frames, found, along / _LENGTH_PX, sd, np.stack(means).round().astype(np.uint8), np.stack(outlines))
+    means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)
+    return ShaftEnd(frames, u[:, :, 0] + along / _LENGTH_PX * axis, along / _LENGTH_PX, sd, means, np.stack(outlines))
 
 
 def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -127,7 +125,8 @@ def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray) -> list[tu
     shown = np.isfinite(u).all(axis=(2, 3)) & inside(u, recording.image_size_px)[:, :, 0]
     found: tuple[list[np.ndarray], ...] = ([], [])
     for k in np.flatnonzero(shown.any(axis=1)):
-        frame, angle, zoom = recording.frames[int(frames[k])], tool_pose(u[k])[1], _LENGTH_PX / tool_length_px(u[k])
+        frame, angle = recording.frames[int(frames[k])], tool_pose(u[k])[1]
+        zoom = _LENGTH_PX / np.linalg.norm(u[k, :, 1:].mean(axis=1) - u[k, :, 0], axis=1)
         for side in np.flatnonzero(shown[k]):
             matrix = window_from_image(u[k, side, 0], angle[side], _SIZE_PX, zoom[side])
             found[side].append(cut((frame.left, frame.right)[side], matrix, _SIZE_PX, border=cv2.BORDER_REPLICATE))
@@ -137,49 +136,52 @@ def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray) -> list[tu
     ]
 
 
-def _outline(radius: float, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a shaft's end in g pictures: points and normals (g, 15, 2) of its half ellipse, and x (10,) back along its lines."""
+def _half_ellipse(radius: float, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (g, 15, 2) of the end of a shaft in g pictures, relative to the base."""
     across = (radius / np.sqrt(1 - sine**2))[:, None]  # relative to the tool's length, which the angle shortens
     along = np.maximum(across * sine[:, None], 0.5)
     x, y = np.cos(_DIRECTIONS_RAD), np.sin(_DIRECTIONS_RAD)
     normal = np.stack([x / along, y / across], axis=-1)
     points = np.stack(np.broadcast_arrays(along * x, across * y), axis=-1)
-    return points, normal / np.linalg.norm(normal, axis=-1, keepdims=True), np.linspace(2, max(1.2 * radius, 16), _STRAIGHT)
+    return points, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def _sides(radius: float, slope: float, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (g, 2, 10, 2) of the two sides of a shaft in g pictures, relative to the base, and normals (2, 10, 2)."""
+    back = np.linspace(2, max(1.2 * radius, 16), _STRAIGHT)
+    back = np.minimum(back, _TAPER_PX) if slope else back
+    across = (radius / np.sqrt(1 - sine**2))[:, None] + slope * back
+    points = np.stack([np.stack(np.broadcast_arrays(-back, sign * across), axis=-1) for sign in (-1, 1)], axis=1)
+    normal = np.array([[slope, -1], [slope, 1]]) / np.hypot(slope, 1)
+    return points, np.broadcast_to(normal[:, None], (2, _STRAIGHT, 2))
 
 
 def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
     """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (slopes, radii, positions across and along)."""
     smooth = [cv2.GaussianBlur(picture, (0, 0), 1.2) for picture in pictures]
-    gx, gy = (np.stack([cv2.Sobel(one, cv2.CV_32F, *order) for one in smooth]) for order in ((1, 0), (0, 1)))
-    level = np.quantile(np.hypot(gx, gy).max(axis=-1).reshape(len(pictures), -1), 0.9, axis=1)[:, None]
-    g, (w, h), middle = np.arange(len(pictures))[:, None], _SIZE_PX, (np.array(_SIZE_PX) - 1) / 2
+    gradient = np.stack([[cv2.Sobel(one, cv2.CV_32F, *order) for one in smooth] for order in ((1, 0), (0, 1))])
+    level = np.quantile(np.hypot(*gradient).max(axis=-1).reshape(len(pictures), -1), 0.9, axis=1)[:, None]
     found = np.full((len(_SLOPES), len(_RADII_PX), len(_ACROSS_PX), len(_ALONG_PX)), -1.0)  # less than any score
     if not level.all():  # pictures without any edge
         return found
+    g, (w, h), gradient = np.arange(len(pictures))[:, None], _SIZE_PX, gradient.reshape(2, -1, 3)
 
-    gradient = np.stack([gx, gy]).reshape(2, -1, gx.shape[-1])
-
-    def clear(x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Gradients across the outline less those along it, in terms of all: their mean over points and pictures."""
-        column, row = np.rint(x).astype(int).clip(0, w - 1), np.rint(y).astype(int).clip(0, h - 1)
-        dx, dy = gradient[:, (g * h + row) * w + column]
+    def clear(points: np.ndarray, normal: np.ndarray, across: float) -> np.ndarray:
+        """At all positions along: the gradient across an outline less that beside it, relative to both; mean over points."""
+        x, y = np.moveaxis(points + _MIDDLE_PX + [0, across], -1, 0)
+        column = np.rint(x + _ALONG_PX[:, None, None]).astype(int).clip(0, w - 1)
+        dx, dy = gradient[:, (g * h + np.rint(y).astype(int).clip(0, h - 1)) * w + column]
         nx, ny = np.moveaxis(normal.astype(np.float32)[..., None], -2, 0)
-        across, along = (np.sqrt(np.einsum("...i,...i", part, part)) for part in (dx * nx + dy * ny, dx * ny - dy * nx))
-        return ((across - _OTHER_EDGES * along) / (across + along + level)).mean(axis=(-2, -1))
+        over, beside = (np.sqrt(np.einsum("...i,...i", part, part)) for part in (dx * nx + dy * ny, dx * ny - dy * nx))
+        return ((over - _OTHER_EDGES * beside) / (over + beside + level)).mean(axis=(-2, -1))
 
     for i, radius in enumerate(_RADII_PX):
-        ellipse, normal, straight = _outline(radius, sine)
-        side = (radius / np.sqrt(1 - sine**2))[:, None]
         for j, across in enumerate(_ACROSS_PX):
-            x0, y0 = middle[0] + _ALONG_PX[:, None, None], middle[1] + across
-            end = clear(x0 + ellipse[..., 0], y0 + ellipse[..., 1], normal)
+            end = clear(*_half_ellipse(radius, sine), across)
             for k, slope in enumerate(_SLOPES if across == 0 else _SLOPES[:1]):
-                back = np.minimum(straight, _TAPER_PX) if slope else straight
-                lines = [
-                    clear(x0 - back, y0 + sign * (side + slope * back), np.array([slope, sign]) / np.hypot(slope, 1))
-                    for sign in (-1, 1)
-                ]
-                found[k, i, j] = 0.6 * end + 0.2 * sum(lines)
+                sides, normal = _sides(radius, slope, sine)
+                lines = clear(sides.reshape(len(sine), -1, 2), normal.reshape(-1, 2), across)
+                found[k, i, j] = _END * end + (1 - _END) * lines
     return found
 
 
