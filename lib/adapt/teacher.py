@@ -31,6 +31,9 @@ from lib.trust.fitting import Problem
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
 #: the share from which no other threshold is tried.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
+#: Least mean confidence of the inliers of a landmark.  If the detector expects most of those that agree with each other to be
+#: wrong, they agree on another point, such as the elbow of a jaw.
+_LEAST_SURE = 0.5
 #: Faults that disqualify the robot as a teacher; and the least share of the residuals that they must explain.
 FAULTS = {
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
@@ -199,9 +202,10 @@ def teach(
         by_hand: Labels set by hand.  They determine the offsets, since detections may show other points of the tool.
 
     Raises:
-        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the cameras are not those of a stereo
-            microscope; a landmark is seen more than 15 % of the tool's length and 0.25 mm off; the standard deviation of its
-            label exceeds `NEAR` of the tool's length; or the robot contradicts the images.
+        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the inliers of a landmark have a mean
+            confidence below 0.5; the cameras are not those of a stereo microscope; a landmark is seen more than 15 % of the tool's
+            length and 0.25 mm off; the standard deviation of its label exceeds `NEAR` of the tool's length; or the robot
+            contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
     refused = _frozen(recording, seen.frame)
@@ -213,6 +217,15 @@ def teach(
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
+    if opinion is None and before is None and by_hand is None:
+        rows, inliers = used.rows(recording), calibration.view_inliers
+        own = (inliers & (rows.landmark == k)[:, None] for k in range(len(LANDMARKS)))
+        sure = [float(rows.confidence[one].sum() / max(one.sum(), 1)) for one in own]
+        if min(sure) < _LEAST_SURE:
+            raise RefusalError(
+                f"detector: it does not know this tool. What it takes for {LANDMARKS[int(np.argmin(sure))]} agrees with the "
+                f"robot, but its mean confidence in that is {min(sure):.2f}: it may be another point. {LABEL}"
+            )
     offsets, turns = calibration.offsets, False
     offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:

@@ -31,7 +31,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.search import PEAKS, best_tools, likelihood, several_peaks
+from lib.landmarks.search import PEAKS, best_tools, likelihood, near_only, several_peaks
 from lib.parallel import single_threaded_torch
 
 FORMAT = "microstereo.detector"
@@ -301,17 +301,16 @@ class Detector:
     def near(self, images: np.ndarray, u: np.ndarray, *, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
         """Detect by the later stages alone, in images (n, h, w, 3) at expected positions u (n, 3, 2) px; NaN = unknown.
 
-        A detection farther than `NEAR` from the expected position counts as missing.  `ground` as in a call.
+        Only what is within `NEAR` of the expected position counts, even if something elsewhere looks more like the landmark,
+        as another point of an unknown tool may.  `ground` as in a call.
         """
         known = np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
         u = np.where(known[..., None], u, np.nan)
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))
         # A window shows the whole tool.  With closeups alone, their constant error would add up if the caller repeats this.
-        stages = [stage for stage in self.stages if stage in ("again", "closeup", "closer")]
-        stages = stages if "again" in stages else ["tracking", "tracking"]
-        for stage in stages:
-            found = self.refine(images, found, stage)
+        for stage in [stage for stage in self.stages if stage in ("again", "closeup", "closer")]:
+            found = self.refine(images, found, stage, reach=NEAR)
         if ground is not None and len(unsure := np.flatnonzero(found.doubtful)):
             again = np.stack([levelled(images[i], ground()[i]) for i in unsure])
             found.put(unsure, found[unsure].surest(self.near(again, u[unsure])))
@@ -397,15 +396,18 @@ class Detector:
         return found, np.clip(height, 0, 1).mean(1)
 
     def refine(
-        self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None, *, only: np.ndarray | None = None
-    ) -> Landmarks:
+        self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None, *, only: np.ndarray | None = None,
+        reach: float | None = None,
+    ) -> Landmarks:  # fmt: skip
         """Refine the landmarks `rough` by a later stage, or by ``"tracking"``.
 
-        `seen` is the result of `stage_peaks` for them, if known.  `only` (n, 3) bool limits closeups to some landmarks.
+        `seen` is the result of `stage_peaks` for them, if known; `only` and `reach` are its arguments.
         """
-        peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
+        peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only, reach)
         result = Landmarks.join([rough])  # a copy
-        fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
+        # While tracking, the previous frame's result is no evidence.
+        before = None if stage == "tracking" else Rough.in_windows(rough.u, rough.confidence, matrices, which)
+        fine = self._measured(peaks, before, stage, which[:, 1:])
         u, back = view.unmapped(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
         confidence = fine.confidence[:, 0]
@@ -420,14 +422,6 @@ class Detector:
         i, k = which.T
         result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence
         return result if stage == "tool" else result.without_unsure()  # the second look may be surer
-
-    def rough_in_windows(self, rough: Landmarks, matrices: np.ndarray, which: np.ndarray, stage: str) -> Rough | None:
-        """The previous stage's result in the pixels of this stage's windows; None for tracking, where it is no evidence."""
-        if stage == "tracking":
-            return None
-        i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
-        parts = view.map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
-        return Rough(*(part[own][:, None] for part in Rough.of(*map(torch.from_numpy, parts))))
 
     def frame_peaks(self, images: ArrayLike) -> Peaks:
         """Peaks of the first stage, in pixels of its input."""
@@ -461,9 +455,13 @@ class Detector:
             return self._run[stage](as_tensor(images))[-1]
 
     def stage_peaks(
-        self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
+        self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None, reach: float | None = None
     ) -> tuple[Peaks, np.ndarray, np.ndarray]:
-        """Peaks (m, 1) of a later stage in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2)."""
+        """Peaks (m, 1) of a later stage in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2).
+
+        `only` (n, 3) bool limits closeups to some landmarks.  In a window, which shows all three landmarks, only peaks within
+        `reach` of u count, a share of the tool's length; None = all.
+        """
         windows, matrices, which = self.windows(images, u, stage, only)
         if not len(which):
             return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2), ()))), matrices, np.zeros((0, 2), int)
@@ -471,9 +469,11 @@ class Detector:
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
             return corrected(closeup_peaks(outputs, size), fit, size, which[:, 1:]), matrices, which
-        # One window holds all three landmarks.
+        stride = self.tool_network.stride
+        if reach is not None:
+            outputs = near_only(outputs, view.map_points(matrices[:, None], np.asarray(u)[which]), reach, stride)
         which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
-        peaks = decode(outputs.flatten(0, 1)[:, None], self.tool_network.stride, method=self.method)
+        peaks = decode(outputs.flatten(0, 1)[:, None], stride, method=self.method)
         return peaks, np.repeat(matrices, 3, axis=0), which
 
     def frame_stride(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:

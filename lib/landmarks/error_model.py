@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lib.landmarks.heatmaps import Peaks
-from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
+from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 
 #: Number of features of a peak.
 FEATURES = 9
@@ -40,6 +40,13 @@ class Rough(NamedTuple):
         shut = (-(u[..., 1, :] - u[..., 2, :]).square().sum(-1) / (_SHUT * length) ** 2).exp()
         shut = torch.where(shut >= 0, shut, torch.zeros_like(shut))  # NaN becomes 0
         return cls(u, logit, *(part.expand_as(logit) for part in (logit.mean(-1, keepdim=True), shut[..., None])))
+
+    @classmethod
+    def in_windows(cls, u: np.ndarray, confidence: np.ndarray, matrices: np.ndarray, which: np.ndarray) -> Self:
+        """Make it from landmarks u (n, 3, 2) px and their confidence (n, 3), for windows as `Detector.stage_peaks` gives."""
+        i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
+        parts = map_points(matrices[:, None], u[i]), confidence[i]
+        return cls(*(part[own][:, None] for part in cls.of(*map(torch.from_numpy, parts))))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Candidates for the tool, put together from the highest peaks of the first stage."""
+"""Peaks of heatmaps: several of them, those near a known place, and the tools that they may belong to."""
 
 import numpy as np
 import torch
@@ -16,14 +16,31 @@ _OPENING_WEIGHT = 0.25
 
 def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the `n` highest peaks of heatmaps (m, k, h, w), 3 sigma apart: centroids (n m, k, 2) px and heights (n m, k)."""
-    rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
     sigma, found = sigma_cells(stride, SIGMA_PX), []
     for _ in range(n):
         found.append(disc_mean(heatmaps, sigma))  # accurate enough: the next stage measures in a window
-        x, y = found[-1][0][..., None, None].unbind(2)
-        heatmaps = heatmaps.masked_fill((columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma) ** 2, -1.0)
+        heatmaps = heatmaps.masked_fill(_apart2(heatmaps, found[-1][0]) < (3 * sigma) ** 2, -1.0)
     u, value = (torch.cat(part) for part in zip(*found, strict=True))
     return (stride * u + (stride - 1) / 2).numpy(), value.numpy()
+
+
+def near_only(heatmaps: torch.Tensor, u: np.ndarray, reach: float, stride: int) -> torch.Tensor:
+    """Heatmaps (n, 3, h, w) without what is farther from the tools u (n, 3, 2) px than `reach`, a share of their length.
+
+    Those of landmarks that are NaN stay as they are.
+
+    >>> near_only(torch.ones(1, 3, 1, 8), np.array([[[2.0, 0], [6, 0], [6, 0]]]), 0.25, 1)[0, 0].tolist()
+    [[0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]]
+    """
+    cells = (u - (stride - 1) / 2) / stride
+    reach2 = torch.from_numpy((reach * tool_length_px(cells)) ** 2)[:, None, None, None]
+    return heatmaps.masked_fill(_apart2(heatmaps, torch.from_numpy(cells)) > reach2, 0.0)
+
+
+def _apart2(heatmaps: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    """Squared distances (m, k, h, w) of the cells of heatmaps from points u (m, k, 2), in cells."""
+    rows, columns = (torch.arange(side, dtype=u.dtype) for side in heatmaps.shape[-2:])
+    return (columns - u[..., None, :1]) ** 2 + (rows[:, None] - u[..., None, 1:]) ** 2
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
 from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
-from lib.landmarks.error_model import FEATURES, ErrorModel, features_of
+from lib.landmarks.error_model import FEATURES, ErrorModel, Rough, features_of
 from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.training.samples import LabelledImage
@@ -150,7 +150,8 @@ def seen_by(
         return Seen(features, errors, tolerance, np.arange(3), moved, known, label_sd)
     peaks, matrices, which = found or detector.stage_peaks(image, rough.u, stage)
     landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
-    features = features_of(peaks.double(), detector.rough_in_windows(rough, matrices, which, stage))
+    before = None if stage == "tracking" else Rough.in_windows(rough.u, rough.confidence, matrices, which)
+    features = features_of(peaks.double(), before)
     feature, moved = features[:, 0].numpy(), np.zeros(at.shape)
     keep = np.ones(len(at), bool)
     if stage in CLOSE:

@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -214,12 +215,23 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
         taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
 
 
+@pytest.mark.parametrize(("confidence", "knows"), [(0.4, False), (0.6, True)])
+def test_landmarks_that_agree_but_that_the_detector_itself_doubts_are_another_point(world, recording, confidence, knows):
+    """The offset of the elbows is one that a robot may have, so it tells nothing."""
+    elbows = world.u.copy()
+    elbows[:, :, 1:] += 0.05 * (elbows[:, :, :1] - elbows[:, :, 1:])
+    seen = look(recording, StandIn(elbows, noise_px=0.7, wrong=0.2), np.arange(world.n))
+    seen.confidence[:, :, 1:] *= confidence / 0.9
+    with nullcontext() if knows else pytest.raises(RefusalError, match="does not know this tool.* tip_1 .*0.40.*Label 10"):
+        teach(recording, seen)
+
+
 class LaterStages(StandIn):
     """Its closeups see what the stand-in finds, wherever they are asked to look."""
 
-    stages, near = ("tracking",), Detector.near
+    stages, near = ("closeup",), Detector.near
 
-    def refine(self, images, rough, stage):
+    def refine(self, images, rough, stage, *, reach):
         return self(images)
 
 
@@ -567,7 +579,7 @@ def test_labels_that_leave_the_places_open_are_refused(world, recording, tmp_pat
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
     class Lost(StandIn):
         networks, closeup_network, stages, near = {}, "some", ("frame", "closeup"), Detector.near
-        refine = staticmethod(lambda pair, rough, setting: Landmarks.none(2))
+        refine = staticmethod(lambda pair, rough, stage, *, reach: Landmarks.none(2))
 
     class ReachedError(Exception):
         """Training starts."""
@@ -596,7 +608,7 @@ def test_a_base_without_an_edge_does_not_drift_along_the_shaft(world, recording,
         stages = ("frame", "tool", "again", "closeup", "closer", "tracking")
 
         @staticmethod
-        def refine(pair, rough, stage):
+        def refine(pair, rough, stage, *, reach):
             u = rough.u.copy()
             if stage == "again":
                 u = world.u[np.nanargmin(np.nansum((world.u - u) ** 2, axis=(1, 2, 3)))].copy()

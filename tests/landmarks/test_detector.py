@@ -176,7 +176,7 @@ def test_what_the_stage_before_found_is_evidence(images):
     u, spread = np.array([[[30.0, 50], [60, 40], [60, 60]]]), np.tile(np.eye(2), (1, 3, 1, 1))
     rough = Landmarks(u, spread, np.array([[0.9, 0.5, 0.1]]))
     peaks, matrices, which = detector.stage_peaks(images[:1], rough.u, "tool")
-    seen = detector.rough_in_windows(rough, matrices, which, "tool")
+    seen = Rough.in_windows(rough.u, rough.confidence, matrices, which)
     np.testing.assert_allclose(seen.logit[:, 0].numpy(), [np.log(9), 0, -np.log(9)], atol=1e-9)
     np.testing.assert_allclose(seen.together.numpy(), 0, atol=1e-9)
     features = features_of(peaks.double(), seen)

@@ -5,9 +5,9 @@ import torch
 
 from lib.landmarks import Detector
 from lib.landmarks.detector import Landmarks
-from lib.landmarks.heatmaps import render
+from lib.landmarks.heatmaps import decode, render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.search import best_tools, likelihood, several_peaks
+from lib.landmarks.search import best_tools, likelihood, near_only, several_peaks
 from lib.landmarks.windows import map_points
 
 TOOL = np.array([[40.0, 50.0], [80.0, 40.0], [80.0, 60.0]])
@@ -17,6 +17,16 @@ def test_the_second_peak_is_found_once_the_first_is_taken_out():
     heatmaps = render(torch.tensor([[[20.0, 30.0]]]), (64, 96), 4) + 0.6 * render(torch.tensor([[[70.0, 33.0]]]), (64, 96), 4)
     u, height = several_peaks(heatmaps, 2, 4)
     assert np.allclose(u[:, 0], [[20, 30], [70, 33]], atol=0.5) and np.allclose(height[:, 0], [1.0, 0.6], atol=0.1)
+
+
+def test_near_a_known_place_the_lower_peak_counts():
+    elbow = torch.tensor(TOOL + [[0.0, 0.0], [-16.0, 4.0], [-16.0, -4.0]])[None]
+    heatmaps = 0.4 * render(torch.tensor(TOOL)[None], (96, 128), 4) + render(elbow, (96, 128), 4)
+    expected = TOOL[None] + 2.0
+    # The border of what counts is near the peak, so a closeup has to measure again.
+    expected[0, 2] = np.nan  # nothing is known of tip_2, so its highest peak counts
+    found = decode(near_only(heatmaps, expected, 0.2, 4), 4).u[0].numpy()
+    assert np.allclose(found[:2], TOOL[:2], atol=2.0) and np.allclose(found[2], elbow[0, 2], atol=0.5)
 
 
 def test_a_tool_needs_equal_jaws_and_the_tips_on_their_sides():
