@@ -203,9 +203,9 @@ def teach(
 
     Raises:
         RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the inliers of a landmark have a mean
-            confidence below 0.5; the cameras are not those of a stereo microscope; a landmark is seen more than 15 % of the tool's
-            length and 0.25 mm off; the standard deviation of its label exceeds `NEAR` of the tool's length; or the robot
-            contradicts the images.
+            confidence below 0.5; the cameras are not those of a stereo microscope; a landmark is seen more than 15 % of the
+            tool's length and 0.25 mm off; the standard deviation of its label exceeds `NEAR` of the tool's length; or the
+            robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
     refused = _frozen(recording, seen.frame)

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import islice
+from itertools import compress, islice
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from tqdm.auto import tqdm
 
 from lib.geometry import check
@@ -37,7 +38,10 @@ from lib.training.samples import Samples, Source
 FORMAT = "microstereo.training"
 #: Attributes of a `Run` that a checkpoint stores beside its tensors.
 _STATE = ("step", "seconds", "log", "loss_sum", "since")
-_OPTIMISERS = {"rmsprop": partial(torch.optim.RMSprop, alpha=0.99), "adamw": partial(torch.optim.AdamW, weight_decay=1e-4)}
+_OPTIMISERS = {
+    "rmsprop": partial(torch.optim.RMSprop, alpha=0.99),
+    "adamw": partial(torch.optim.AdamW, weight_decay=1e-4, fused=True),
+}
 #: Time between checkpoints, so the most that a killed training loses.
 _SAVE_EVERY_S = 50.0
 
@@ -286,9 +290,12 @@ class Run:
         if self.average is not None:
             # The decay is smaller in the first steps, so that the average forgets the random initial weights.
             decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-            means, values = (network.state_dict().values() for network in (self.average, self.network))
+            means, values = (list(network.state_dict().values()) for network in (self.average, self.network))
+            blended = [mean.is_floating_point() for mean in means]
+            get_ema_multi_avg_fn(decay)(list(compress(means, blended)), list(compress(values, blended)), None)
             for mean, value in zip(means, values, strict=True):
-                mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
+                if not mean.is_floating_point():  # a count
+                    mean.copy_(value)
         self.step += 1
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
@@ -329,6 +336,8 @@ class Run:
             self.average.load_state_dict(_part(tensors, "average."))
         parts = ((i, _part(tensors, f"optimiser.{i}.")) for i, _ in enumerate(self.network.parameters()))
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": {i: part for i, part in parts if part}})
+        for weight, values in self.optimiser.state.items():  # the fused optimiser needs the weight's order in memory
+            values |= {k: torch.empty_like(weight).copy_(v) for k, v in values.items() if v.shape == weight.shape}
         for name in _STATE:
             setattr(self, name, metadata[name])
 

@@ -89,7 +89,9 @@ class SceneSource(Source):
         scale = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
         if scale < 0.8:  # interpolation alone would alias
             image = cv2.GaussianBlur(image, (0, 0), 0.45 * np.sqrt(1 / scale**2 - 1))
-        fill = image.mean((0, 1)) * rng.uniform(0.5, 1.2) if self.disguise and rng.random() < 0.35 else np.zeros(3)
+        fill = np.zeros(3)
+        if self.disguise and rng.random() < 0.35:
+            fill = np.array(cv2.mean(image)[:3]) * rng.uniform(0.5, 1.2)
         image = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=fill.tolist())
         length = scale * _length_px(u, visibility)
         u = windows.map_points(matrix, u)

@@ -4,6 +4,7 @@ import os
 import socket
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from lib.landmarks.heatmaps import render
-from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
 from lib.training import loop
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch
 from lib.training.loop import PRESETS, TrainingConfig, heatmap_loss, load_training, offset_loss, train
@@ -378,3 +379,17 @@ def test_an_offset_network_learns_where_a_dot_is_and_how_well_it_knows(tmp_path)
     assert half.provenance["steps"] < 6
     resumed = train(short, source, unseen, tmp_path / "parts", progress=False)
     assert same(resumed.network, train(short, source, unseen, progress=False).network)
+
+
+def test_the_fused_optimiser_takes_the_steps_of_the_plain_one(monkeypatch):
+    """It ignores the order of a tensor in memory, which differs between weights and what a checkpoint restores."""
+    some = toy_samples(4)
+    batch = Batch(as_tensor(some.images), torch.from_numpy(some.u).float(), torch.from_numpy(some.visibility))
+    runs = [loop.Run(TOGETHER)]
+    monkeypatch.setitem(loop._OPTIMISERS, "adamw", partial(torch.optim.AdamW, weight_decay=1e-4))
+    runs.append(loop.Run(TOGETHER))
+    for _ in range(3):
+        for run in runs:
+            run.advance(batch)
+    fused, plain = (torch.cat([p.flatten() for p in run.network.parameters()]) for run in runs)
+    assert torch.allclose(fused, plain, atol=1e-4)
