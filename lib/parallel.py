@@ -79,6 +79,24 @@ def single_threaded_torch() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def quick_turns() -> Iterator[None]:
+    """Run the block, or the decorated function, with Python's threads taking turns every 0.1 ms in place of 5 ms.
+
+    A thread that leaves the interpreter for a short operation, such as one of numpy, waits that long before it goes on.
+
+    >>> with quick_turns():
+    ...     round(sys.getswitchinterval(), 6)
+    0.0001
+    """
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextlib.contextmanager
 def single_threaded_blas() -> Iterator[None]:
     """Run the block, or the decorated function, with a single thread for numpy's and scipy's linear algebra.
 

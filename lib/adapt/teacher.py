@@ -31,8 +31,8 @@ from lib.trust.fitting import Problem
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
 #: the share from which no other threshold is tried.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
-#: Least mean confidence of the inliers of a landmark.  If the detector expects most of those that agree with each other to be
-#: wrong, they agree on another point, such as the elbow of a jaw.
+#: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be wrong,
+#: they agree on another point, such as the elbow of a jaw.
 _LEAST_SURE = 0.5
 #: Faults that disqualify the robot as a teacher; and the least share of the residuals that they must explain.
 FAULTS = {
@@ -202,7 +202,7 @@ def teach(
         by_hand: Labels set by hand.  They determine the offsets, since detections may show other points of the tool.
 
     Raises:
-        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the inliers of a landmark have a mean
+        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the inliers of a tip have a mean
             confidence below 0.5; the cameras are not those of a stereo microscope; a landmark is seen more than 15 % of the
             tool's length and 0.25 mm off; the standard deviation of its label exceeds `NEAR` of the tool's length; or the
             robot contradicts the images.
@@ -219,13 +219,13 @@ def teach(
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
     if opinion is None and before is None and by_hand is None:
         rows, inliers = used.rows(recording), calibration.view_inliers
-        own = (inliers & (rows.landmark == k)[:, None] for k in range(len(LANDMARKS)))
-        sure = [float(rows.confidence[one].sum() / max(one.sum(), 1)) for one in own]
-        if min(sure) < _LEAST_SURE:
-            raise RefusalError(
-                f"detector: it does not know this tool. What it takes for {LANDMARKS[int(np.argmin(sure))]} agrees with the "
-                f"robot, but its mean confidence in that is {min(sure):.2f}: it may be another point. {LABEL}"
-            )
+        for k, tip in enumerate(LANDMARKS[1:], 1):  # the base has an end of its own, `with_base`
+            sure = rows.confidence[inliers & (rows.landmark == k)[:, None]]
+            if len(sure) and sure.mean() < _LEAST_SURE:
+                raise RefusalError(
+                    f"detector: it does not know this tool. What it takes for {tip} agrees with the robot, but its mean "
+                    f"confidence in that is {sure.mean():.2f}: it may be another point. {LABEL}"
+                )
     offsets, turns = calibration.offsets, False
     offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:

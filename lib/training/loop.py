@@ -30,7 +30,7 @@ from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
 from lib.landmarks.metrics import score, tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, network_of
-from lib.parallel import cores
+from lib.parallel import cores, quick_turns
 from lib.provenance import commit_id, machine
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.training.samples import Samples, Source
@@ -342,6 +342,7 @@ class Run:
             setattr(self, name, metadata[name])
 
 
+@quick_turns()
 def train(
     config: TrainingConfig, source: Source, validation: Samples, folder: str | Path | None = None, *,
     initial: Training | None = None, max_seconds: float | None = None, progress: bool | Callable[[float], None] = True,

@@ -1,7 +1,6 @@
 """The detector's stages: training data and configuration, fine-tuning on labelled frames, and assembly to a detector."""
 
 import json
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +19,7 @@ from lib.landmarks import Detector
 from lib.landmarks.detector import CLOSE
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
-from lib.parallel import cores, single_threaded_torch
+from lib.parallel import cores, quick_turns, single_threaded_torch
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording
 from lib.simulator.population import VALIDATION_TEXTURE_SEEDS, sample
@@ -40,8 +39,6 @@ LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Fine-tuning beside simulated frames: share of the draws that are labelled frames, and share of these with a changed look.
 _OWN_SHARE, _OWN_DISGUISE = 0.75, 0.2
 _RATES = {"frame": 5e-4, "tool": 1e-3, "closeup": 5e-4}  # chosen on two simulated recordings of the validation families
-#: Threads take turns this often.  With Python's 5 ms, a thread waits that long after each of its many short operations.
-_TURN_S = 1e-4
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -73,6 +70,7 @@ def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
     return Samples.drawn(_SOURCES[stage].of(shown, still=True))
 
 
+@quick_turns()
 def finetune(
     detector: Detector, images: Sequence[LabelledImage], held_out: Sequence[LabelledImage], folder: str | Path, *,
     simulated: str | Path | Sequence[LabelledImage] | None = None, steps: int = 300, minutes: float | None = None,
@@ -133,8 +131,6 @@ def finetune(
     threads = 1 if torch.cuda.is_available() else min(cores(), len(names))
     networks = {}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
-    turn_s = sys.getswitchinterval()
-    sys.setswitchinterval(_TURN_S)
     with single_threaded_torch(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
             for found in as_completed([pool.submit(trained, lane) for lane in lanes]):
@@ -142,8 +138,6 @@ def finetune(
         except BaseException:
             stopped.set()
             raise
-        finally:
-            sys.setswitchinterval(turn_s)
     added = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
     tuned = replace(detector, **networks, metadata=detector.metadata | added)
     tuned = fit_error_models(tuned, [*held_out, *extra_held_out], anew=False, progress=progress is True)
