@@ -31,8 +31,8 @@ from lib.trust.fitting import Problem
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
 #: the share from which no other threshold is tried.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
-#: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be wrong,
-#: they agree on another point, such as the elbow of a jaw.
+#: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
+#: wrong, they agree on another point, such as the elbow of a jaw.
 _LEAST_SURE = 0.5
 #: Faults that disqualify the robot as a teacher; and the least share of the residuals that they must explain.
 FAULTS = {
