@@ -23,8 +23,8 @@ def test_near_a_known_place_the_lower_peak_counts():
     elbow = torch.tensor(TOOL + [[0.0, 0.0], [-16.0, 4.0], [-16.0, -4.0]])[None]
     heatmaps = 0.4 * render(torch.tensor(TOOL)[None], (96, 128), 4) + render(elbow, (96, 128), 4)
     expected = TOOL[None] + 2.0
-    # The border of what counts is near the peak, so a closeup has to measure again.
     expected[0, 2] = np.nan  # nothing is known of tip_2, so its highest peak counts
+    # The border of what counts cuts off a part of the peak, so a closeup has to measure again.
     found = decode(near_only(heatmaps, expected, 0.2, 4), 4).u[0].numpy()
     assert np.allclose(found[:2], TOOL[:2], atol=2.0) and np.allclose(found[2], elbow[0, 2], atol=0.5)
 
