@@ -82,7 +82,7 @@ def single_threaded_torch() -> Iterator[None]:
 def quick_turns() -> Iterator[None]:
     """Run the block, or the decorated function, with Python's threads taking turns every 0.1 ms in place of 5 ms.
 
-    A thread that leaves the interpreter for a short operation, such as one of numpy, waits that long before it goes on.
+    After each operation outside the interpreter, such as one of numpy, a thread may have to wait for its turn.
 
     >>> with quick_turns():
     ...     round(sys.getswitchinterval(), 6)

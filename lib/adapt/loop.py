@@ -45,8 +45,8 @@ _SIMULATED_SHARDS = 3
 #: Relative change of the mean distance from the robot in the frames for stopping.  A round that gains less than this is the
 #: last, and one that loses more is not kept.  Those frames are few, so the frames for judging decide.
 _LEAST_GAIN = 0.03
-#: Least gain on the frames for judging, in its standard deviations, if new weights are kept; and largest loss of the epipolar
-#: distance, which does not depend on the robot.  It may hardly change: wrong points that both images show are consistent.
+#: Least gain on the frames for judging, in its standard deviations, if new weights are kept.  The epipolar distance, which
+#: does not depend on the robot, must improve as well.
 _SURE_GAIN = 1.0
 #: Most rounds of detection near the robot's landmarks before any training, and the share of the tool's length by which the
 #: robot's landmarks must move for another such round.
@@ -65,7 +65,7 @@ class Adaptation:
         detector: The adapted one if `improved`, else the one that was given.
         calibration: From detections in the frames for learning; None if the recording could not teach.
         report: The content of report.json.
-        improved: True if the frames for judging agree better with the robot, and the two images no worse with each other.
+        improved: True if the frames for judging agree better, both with the robot and between the two images.
         frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
         after, seen, told: In the frames for judging: the agreement of the adapted detector with the robot, the detections
             before and after, and the robot's landmarks (m, 2, 3, 2) px.
@@ -378,15 +378,12 @@ class _Work:
         told, spread = teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
-        worse, unknown = eye < -_SURE_GAIN * eye_sd, np.isinf(eye_sd)
-        improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and not (worse or unknown)
+        improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and eye > 0
         reasons = {
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than its standard deviation": not robot > _SURE_GAIN * robot_sd,
-            "left and right of the frames for judging, independently of the robot, agree worse": worse,
-            "too few landmarks of the frames for judging are known in both images to compare left with right": unknown,
-            "the frames for judging agree better with the robot, and left with right": eye > _SURE_GAIN * eye_sd,
-            "the frames for judging agree better with the robot, and left with right as before": True,
+            "left and right of the frames for judging, independently of the robot, do not agree better": not eye > 0,
+            "the frames for judging agree better with the robot, and left with right": True,
         }
         labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
         unsure = not len(self.marked) and np.nanmax(labels_sd_px) > _UNSURE * np.nanmean(length)

@@ -25,9 +25,9 @@ def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarr
 
 
 def near_only(heatmaps: torch.Tensor, u: np.ndarray, reach: float, stride: int) -> torch.Tensor:
-    """Heatmaps (n, 3, h, w) without what is farther from the tools u (n, 3, 2) px than `reach`, a share of their length.
+    """Set heatmaps (n, 3, h, w) to 0 where a cell is farther from the heatmap's landmark in u (n, 3, 2) px than `reach`.
 
-    Those of landmarks that are NaN stay as they are.
+    `reach` is a share of the tool's length.  The heatmap of a landmark that is NaN does not change.
 
     >>> near_only(torch.ones(1, 3, 1, 8), np.array([[[2.0, 0], [6, 0], [6, 0]]]), 0.25, 1)[0, 0].tolist()
     [[0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]]

@@ -408,16 +408,14 @@ def continued(world, recording, tmp_path_factory):
         return adapt(recording, detector, folder=folder, progress=False, tune=tune), detector, tune
 
 
-@pytest.mark.parametrize(("factor", "reason"), [(1.0, "as before"), (1.05, "agree worse"), (0.5, "left with right$")])
-def test_left_and_right_veto_an_adaptation_only_if_they_agree_worse(
-    world, recording, tmp_path, monkeypatch, factor, reason
-):
-    """Wrong points that both images show agree as well as right ones."""
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.05])
+def test_an_adaptation_is_kept_only_if_left_and_right_agree_better(world, recording, tmp_path, monkeypatch, factor):
+    """Whatever the robot says."""
     apart = np.random.default_rng(0).uniform(2, 4, (world.n, 3))
     monkeypatch.setattr(loop, "epipolar_px", lambda _, seen, __: [f * apart[: len(seen[0].frame)] for f in (1.0, factor)])
     monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
     found = adapt(recording, StandIn(world.u, wrong=0.5), folder=tmp_path, progress=False, tune=pupil(world))
-    assert re.search(reason, found.report["reason"]) and found.improved == (factor <= 1)
+    assert found.improved == (factor < 1) == ("do not agree better" not in found.report["reason"])
 
 
 def test_a_half_wrong_detector_is_improved(continued):
