@@ -21,7 +21,7 @@ from lib.landmarks import Detector, Landmarks
 from lib.recordings import Annotator, Recording, RecordingWriter
 from lib.trust import check
 from lib.workbench import pages, report, results
-from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
+from lib.workbench.execution import ALONE, declared_grid, declared_parameters, parse_parameters
 from notebooks.figures import verdicts
 from notebooks.figures.course import in_range
 from tests.remembering import remembering_recordings
@@ -99,6 +99,15 @@ def test_a_parameter_keeps_its_value_after_the_first_cells(path):
         own = {node for part in ast.walk(tree) if isinstance(part, inner) for node in ast.walk(part)}
         stored = {n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)} - own
         assert not names & {node.id for node in stored}, cell.id
+
+
+@each(WALK)
+def test_what_takes_the_time_of_a_cell_runs_alone(path):
+    """Else the time would depend on what the other notebooks of the run compute at that moment."""
+    timed = re.compile(r"report\.timed\(|perf_counter\(|timeit\.|max_seconds=|minutes=|SharedDetector\(\)|\.step\(")
+    for cell in code_cells(path)[1:]:
+        if timed.search(cell.source) and "basis" not in cell.metadata.get("tags", []):
+            assert ALONE in cell.metadata.get("tags", []), cell.id
 
 
 @each(WALK)

@@ -1,4 +1,4 @@
-"""``python3 -m lib run``: executes the notebooks one after the other, and updates the report after each."""
+"""``python3 -m lib run``: executes the notebooks, several at once, and updates the report after each."""
 
 import argparse
 import contextlib
@@ -10,17 +10,24 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
+from tqdm.auto import tqdm
+
 from lib import files, paths
+from lib.parallel import cores
 from lib.provenance import commit, machine
 from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
 
 #: A file that reserves space, so that a run can write its last state when the disk is full.
 _ROOM = ".room"
+#: The most notebooks that run at once if the command does not say how many: each may need 3 GB of memory.
+_AT_ONCE = 4
 
 
 def main(argv: Sequence[str]) -> int:
@@ -31,6 +38,7 @@ def main(argv: Sequence[str]) -> int:
     add("--profile", choices=("quick", "paper"), default="quick", help="quick: minutes; paper: the paper's sizes")
     add("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="set a declared parameter")
     add("--cell-timeout", type=execution.positive, metavar="S", help="longest time of one cell (default: 900 for quick)")
+    add("--jobs", type=int, metavar="N", help=f"notebooks at once (default: one for each core, at most {_AT_ONCE})")
     add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="folder for the run's folder")
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
@@ -43,7 +51,8 @@ def main(argv: Sequence[str]) -> int:
     for name in ("SIGTERM", "SIGHUP"):  # as with Ctrl-C, the report then states that the run was stopped
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:  # nohup ignores one
             signal.signal(getattr(signal, name), stop)
-    result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
+    names, profile, pairs = options.notebooks, options.profile, options.pairs
+    result = run(names, profile, pairs, cell_timeout_s=timeout, jobs=options.jobs, runs=options.runs)
     return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
 
 
@@ -67,31 +76,50 @@ def main_site(argv: Sequence[str]) -> int:
 
 def run(
     names: Sequence[str] = (), profile: str = "quick", pairs: Sequence[tuple[str, str]] = (), *,
-    cell_timeout_s: float | None = None, runs: Path = paths.RUNS, notebooks: Path = paths.NOTEBOOKS,
+    cell_timeout_s: float | None = None, jobs: int | None = None, runs: Path = paths.RUNS, notebooks: Path = paths.NOTEBOOKS,
 ) -> dict:  # fmt: skip
-    """Execute notebooks into a new folder of `runs`, and return the content of its metrics.json.
+    """Execute notebooks, `jobs` at once, into a new folder of `runs`, and return the content of its metrics.json.
 
-    If a notebook fails, the others still run.  The report is written after each, so a killed run leaves a readable one.  An
-    unknown notebook or parameter, or a value of the wrong type, is a ValueError before anything runs.  An OSError means that
-    the report cannot be written; its state is then "failed", if that can still be written.
+    While a cell that is tagged `lib.workbench.execution.ALONE` runs, the other notebooks wait.  If a notebook fails, the
+    others still run.  The report is written after each, so a killed run leaves a readable one.  An unknown notebook or
+    parameter, or a value of the wrong type, is a ValueError before anything runs.  An OSError means that the report cannot
+    be written; its state is then "failed", if that can still be written.
     """
     chosen = execution.choose_notebooks(names, notebooks)
     values = execution.parse_parameters(pairs, chosen, profile)
+    jobs = min(cores(), _AT_ONCE) if jobs is None else jobs
+    if jobs < 1:
+        raise ValueError(f"jobs: {jobs} notebooks at once; give at least 1.")
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
-    width = max(len(book.stem) for book in chosen)
+    width, places = max(len(book.stem) for book in chosen), execution.Places(jobs)
+
+    def work(number: int) -> None:
+        book, label = chosen[number], f"[{number + 1}/{len(chosen)}] {chosen[number].stem:<{width}}"
+        with places.taken() as begin:
+            start = time.monotonic()
+            report.begin(number)
+            limits = {"cell_timeout_s": cell_timeout_s, "begin": begin}
+            failure = execute(book, report.folder / book.name, values[book], label=label, **limits)
+            if places.closed:
+                return
+            seconds = time.monotonic() - start
+            report.end(number, failure, seconds)
+            with tqdm.external_write_mode():
+                print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
+
     try:
         paths.CACHE.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
             os.environ[paths.SHARED_VARIABLE] = shared  # inherited by the kernels
-            for number, book in enumerate(chosen):
-                label = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}"
-                start = time.monotonic()
-                report.content["notebooks"][number]["state"] = "running"
-                report.write()
-                failure = execute(book, report.folder / book.name, values[book], cell_timeout_s=cell_timeout_s, label=label)
-                seconds = time.monotonic() - start
-                report.end(number, failure, seconds)
-                print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
+            with ThreadPoolExecutor(jobs) as pool:
+                try:
+                    for future in as_completed([pool.submit(work, number) for number in range(len(chosen))]):
+                        future.result()
+                except BaseException:
+                    places.closed = True
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    execution.end_kernels()
+                    raise
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
@@ -153,12 +181,24 @@ class _Report:
             "verdict": None, "reasons": [], "metrics": [], "figures": [], "download": None,
         }  # fmt: skip
         self.content["previous"] = previous_values(folder.parent, self.content)
+        self._lock = threading.RLock()  # several notebooks may begin and end at once
         (folder / "figures").mkdir()
         (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()
 
+    def begin(self, number: int) -> None:
+        """State that a notebook runs."""
+        with self._lock:
+            self.content["notebooks"][number]["state"] = "running"
+            self.write()
+
     def end(self, number: int, failure: Failure | None, seconds: float) -> None:
         """Collect what a notebook recorded, even if it failed later, and write its page."""
+        with self._lock:
+            self._collect(number, failure, seconds)
+            self.write()
+
+    def _collect(self, number: int, failure: Failure | None, seconds: float) -> None:
         book, content = self.notebooks[number], self.content
         entry, executed = content["notebooks"][number], self.folder / book.name
         entry |= {"state": "failed" if failure else "complete", "seconds": round(seconds, 2)}
@@ -185,7 +225,9 @@ class _Report:
                 shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
             files.write_text(self.folder / f"{book.stem}.html", text)
             entry |= {"page": f"{book.stem}.html", "executed": book.name}
-        self.write()
+            place = [other.stem for other in self.notebooks].index
+            for found in (content["metrics"], content["figures"]):
+                found.sort(key=lambda one: place(one["notebook"]))  # not in the order in which the notebooks ended
 
     def finish(self, state: str | None = None) -> None:
         failed = any(entry["state"] == "failed" for entry in self.content["notebooks"])

@@ -9,10 +9,11 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import distributions
 from pathlib import Path
+from threading import Lock, Semaphore
 from typing import NamedTuple
 
 import nbformat
@@ -27,6 +28,8 @@ _PACKAGES = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "ope
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
+#: Tag of a cell during which no other notebook of the run may compute: it measures time, or trains for a limited time.
+ALONE = "alone"
 #: Environment variables for the kernels.
 _KERNEL_ENVIRONMENT = {
     "MICROSTEREO_PAGE": "1",  # controls must work in a page, without a kernel
@@ -146,12 +149,60 @@ class Failure(NamedTuple):
         return f"{self.kind}{f' in cell {self.cell}' if self.cell else ''}: {self.message}"
 
 
+class Places:
+    """Places for the notebooks that run at once: each holds one of them, or all during a cell that is tagged `ALONE`."""
+
+    def __init__(self, number: int):
+        self.number, self.closed = number, False
+        self._free, self._queue = Semaphore(number), Lock()
+
+    @contextmanager
+    def taken(self) -> Iterator[Callable[[nbformat.NotebookNode], None]]:
+        """Hold a place during the block; what this yields must be called before each code cell, and waits for its turn.
+
+        It raises a RuntimeError once the places are `closed`.
+        """
+        held = 0
+
+        def hold(number: int) -> None:
+            nonlocal held
+            while held:
+                self._free.release()
+                held -= 1
+            with self._queue:  # whoever waits for all places is not overtaken
+                while held < number:
+                    self._free.acquire()
+                    held += 1
+
+        def begin(cell: nbformat.NotebookNode) -> None:
+            hold(self.number if ALONE in cell.metadata.get("tags", []) else 1)
+            if self.closed:
+                raise RuntimeError("the run was stopped")
+
+        try:
+            hold(1)
+            yield begin
+        finally:
+            hold(0)
+
+
+def end_kernels() -> None:
+    """Kill the kernels that this process has started; a notebook that runs in one of them then fails."""
+    import psutil
+
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):  # it has ended
+            if "ipykernel_launcher" in process.cmdline():
+                process.kill()
+
+
 def execute(
-    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None, label: str = ""
-) -> Failure | None:
+    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None, label: str = "",
+    begin: Callable[[nbformat.NotebookNode], None] = lambda cell: None,
+) -> Failure | None:  # fmt: skip
     """Execute `notebook` into `output`, which is written after each cell; returns None if every cell completed.
 
-    With a `label` a terminal shows the number of cells that are done.
+    With a `label` a terminal shows the number of cells that are done.  `begin` is called before each code cell.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError, strip_color
@@ -161,6 +212,8 @@ def execute(
     def on_cell_start(cell, cell_index):
         nonlocal running
         running += "injected-parameters" not in cell.metadata.get("tags", [])  # papermill's own does not count
+        if cell.cell_type == "code":
+            begin(cell)
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
