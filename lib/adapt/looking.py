@@ -8,6 +8,7 @@ import numpy as np
 from lib.correspondences import Correspondences, of_recording
 from lib.landmarks import with_ground
 from lib.landmarks.contrast import levelled
+from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
@@ -58,12 +59,12 @@ def look(
     recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
-    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search there."""
+    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search only there."""
     found, known = [], with_ground(detector, recording)
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])
-        found.append(detector(pair, **known) if near is None else detector.near(pair, near[i], **known))
+        found.append(detector(pair, **known) if near is None else detector.near(pair, near[i], reach=NEAR, **known))
         progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
 

@@ -61,6 +61,7 @@ NEAR = 0.1
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 #: The second look at the tool averages the heatmaps of the window and of its mirror image: they are low if the two disagree.
 MIRRORED = "again"
+_Ground = Callable[[], np.ndarray] | None  # returns the images without the tool, as in `Detector.__call__`
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ class Detector:
             cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
             raise ValueError(f"{path}: {what}; {cure}.")
 
-    def __call__(self, images: ArrayLike, *, batch: int = 4, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
+    def __call__(self, images: ArrayLike, *, batch: int = 4, ground: _Ground = None) -> Landmarks:
         """Detect the landmarks in images (n, h, w, 3), uint8 RGB or float in [0, 1], `batch` images at a time.
 
         If the result is unsure, the detector looks again with more contrast, then sweeps the image, which takes many times
@@ -248,7 +249,7 @@ class Detector:
             parts = (slice(start, start + batch) for start in range(0, len(images), batch))
             return Landmarks.join([self._seen(images[p], ground and (lambda p=p: ground()[p])) for p in parts])
 
-    def _seen(self, images: np.ndarray, ground: Callable[[], np.ndarray] | None) -> Landmarks:
+    def _seen(self, images: np.ndarray, ground: _Ground) -> Landmarks:
         """Detect in a few images.  If unsure, look again with more contrast, then sweep; the surest result counts."""
         result = self._once(images)
         looks = [lambda i: equalised(images[i]), lambda i: stretched(images[i]), lambda i: images[i]]
@@ -275,9 +276,8 @@ class Detector:
         return result
 
     def track(
-        self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM,
-        ground: Callable[[], np.ndarray] | None = None,
-    ) -> Landmarks:  # fmt: skip
+        self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM, ground: _Ground = None
+    ) -> Landmarks:
         """Follow the landmarks `previous` into the images (n, h, w, 3), such as the next left and right image.
 
         Only closeups are used.  An image with a landmark below `min_confidence` is searched as in a call, with `ground`.
@@ -298,11 +298,11 @@ class Detector:
             result.put(lost, self(images[lost], ground=ground and (lambda: ground()[lost])))
         return result.without_unsure()
 
-    def near(self, images: np.ndarray, u: np.ndarray, *, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
+    def near(self, images: np.ndarray, u: np.ndarray, *, ground: _Ground = None, reach: float | None = None) -> Landmarks:
         """Detect by the later stages alone, in images (n, h, w, 3) at expected positions u (n, 3, 2) px; NaN = unknown.
 
-        Only what is within `NEAR` of the expected position counts, even if something elsewhere looks more like the landmark,
-        as another point of an unknown tool may.  `ground` as in a call.
+        Detections farther away than `NEAR` count as missing.  With `reach`, a share of the tool's length, only peaks within it
+        count, even if another point of an unknown tool looks more like the landmark.  `ground` as in a call.
         """
         known = np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
@@ -310,10 +310,10 @@ class Detector:
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))
         # A window shows the whole tool.  With closeups alone, their constant error would add up if the caller repeats this.
         for stage in [stage for stage in self.stages if stage in ("again", "closeup", "closer")]:
-            found = self.refine(images, found, stage, reach=NEAR)
+            found = self.refine(images, found, stage, reach=reach)
         if ground is not None and len(unsure := np.flatnonzero(found.doubtful)):
             again = np.stack([levelled(images[i], ground()[i]) for i in unsure])
-            found.put(unsure, found[unsure].surest(self.near(again, u[unsure])))
+            found.put(unsure, found[unsure].surest(self.near(again, u[unsure], reach=reach)))
         found.confidence[found.away(u)] = 0.0
         return found.without_unsure()
 

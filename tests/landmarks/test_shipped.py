@@ -58,6 +58,10 @@ def test_a_tool_is_found_where_it_is_expected_and_nowhere_else(shipped):
     assert both.mean() > 0.6 and (np.linalg.norm(found.u - whole.u, axis=2)[both] < 0.03 * length.mean()).all()
     elsewhere = expected + 1.5 * length.mean()
     assert (shipped.default.near(shipped.images[:2], elsewhere).confidence < 0.5).all()
+    # The cameras may have moved: what lies just too far away is missing, and not drawn to where it is expected.
+    beside = whole.u + 0.13 * length.mean() * np.array([0.8, 0.6])
+    drawn = np.linalg.norm(shipped.default.near(shipped.images[:2], beside).u - whole.u, axis=2)
+    assert not (drawn[whole.confidence > 0.5] > 0.05 * length.mean()).any()
     expected[0, 0] = np.nan  # no window without a base
     assert np.isnan(shipped.default.near(shipped.images[:2], expected).u[0]).all()
 

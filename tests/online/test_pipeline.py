@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lib import paths
 from lib.calibration import calibrate
 from lib.calibration.offsets import tool_axes
-from lib.correspondences import Correspondences, pair_with_robot
+from lib.correspondences import Correspondences, of_recording, pair_with_robot
 from lib.geometry import RigidTransform
-from lib.landmarks import Landmarks, SharedDetector
-from lib.online import STAGES, Settings
+from lib.landmarks import Detector, Landmarks, SharedDetector
+from lib.online import STAGES, OnlinePipeline, Settings
+from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.moved_cameras import random_motion
 from tests.online.world import BLACK, CENTRE_MM, DEPTH_MM, RIG, SELDOM, World, make, rig_error_mm, run, started
@@ -230,6 +234,21 @@ def test_a_detector_that_takes_another_tool_looks_where_the_robot_says():
     assert [frame for frame, _ in asked] == list(range(20, 30))
     told = np.stack(world.rig.project(world.x_mm[29]))
     assert np.abs(asked[-1][1] - told).max() < 15 and np.abs(results[-1].landmarks.u_left - told[0]).max() < 6
+
+
+def test_a_push_is_noticed_by_the_detector_that_ships():
+    """The search near the robot's landmarks, which are wrong after a push, must not draw the detections there."""
+    source = Recording.open(paths.SHIPPED_RECORDING)
+    pipeline, results = OnlinePipeline(Detector.load(), rig=source.truth.rig, settings=SELDOM), []
+    for i, shift_px in enumerate([0.0] * 3 + [34.0] * 4):
+        move = np.array([[1.0, 0.0, 0.8 * shift_px], [0.0, 1.0, -0.6 * shift_px]])
+        sides = [getattr(source.frames[i], side) for side in ("left", "right")]
+        images = [cv2.warpAffine(image, move, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT) for image in sides]
+        results.append(pipeline.step(*images, partial(of_recording, source, frames=[i]), time_s=source.frames.time_s[i]))
+        error_px = np.linalg.norm(results[-1].landmarks.u_left - source.truth.u_left[i] - move[:, 2], axis=1)
+        assert np.nanmax(error_px) < 5
+    assert [result.state for result in results[:5]] == ["tracking"] * 3 + ["moved"] * 2
+    assert results[-1].state == "tracking" and results[-1].motion is not None
 
 
 def test_where_the_robot_says_allows_for_the_landmarks_offsets():
