@@ -166,13 +166,12 @@ class Places:
 
         def hold(number: int) -> None:
             nonlocal held
-            while held:
-                self._free.release()
-                held -= 1
+            if held:
+                self._free.release(held)
             with self._queue:  # whoever waits for all places is not overtaken
-                while held < number:
+                for _ in range(number):
                     self._free.acquire()
-                    held += 1
+            held = number
 
         def begin(cell: nbformat.NotebookNode) -> None:
             hold(self.number if ALONE in cell.metadata.get("tags", []) else 1)
