@@ -128,7 +128,7 @@ def shallow_bias(table: Table) -> Figure:
 
 
 def ladder_table(comparison: Comparison, caption: str) -> HTML:
-    """The compared models: number of parameters, chi-square, BIC less the best one, p-value of the constraint."""
+    """The compared models: number of parameters, chi-square, BIC minus the best one, p-value of the constraint."""
     rows = [
         [rung.model + (", chosen" if rung is comparison.best else ""), rung.parameters, f"{rung.chi_square:.1f}",
          f"{rung.bic - comparison.best.bic:.1f}", "" if rung.against is None else f"{rung.p_value:.2g}"]
@@ -138,7 +138,7 @@ def ladder_table(comparison: Comparison, caption: str) -> HTML:
 
 
 def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
-    """BIC of each model less that of the best one, one panel for each data set."""
+    """BIC of each model minus that of the best one, one panel for each data set."""
     page, axes = figure(1, len(comparisons), width_in=12, height_in=3.8, sharey=True, squeeze=False)
     most = max(rung.bic - comparison.best.bic for comparison in comparisons.values() for rung in comparison.rungs)
     for ax, (title, comparison) in zip(axes[0], comparisons.items(), strict=True):
@@ -233,7 +233,7 @@ def residuals(calibration: Calibration) -> Figure:
     c = len(calibration.cameras)
     page, axes = figure(1, c + 1, width_in=13, height_in=3.6)
     kept = []
-    # Enlarge the arrows as far as nine in ten are shorter than a seventh of the extent of the landmarks.
+    # The largest factor with which nine in ten arrows stay shorter than a seventh of the landmarks' extent.
     longest = np.nanquantile(np.abs(calibration.residuals_px), 0.9)
     span_px = np.nanmax(np.nanmax(calibration.y_px, axis=0) - np.nanmin(calibration.y_px, axis=0))
     times = next((n for n in (25, 10, 5, 2) if 7 * n * longest < span_px), 1)
@@ -452,7 +452,7 @@ def offsets(names: Sequence[str], found: LandmarkOffsets, *, unit_um: float = 1e
     ax.set(
         xticks=at,
         xticklabels=["along the tool", "from tip to tip", "normal to both"],
-        ylabel="seen minus reported (um)",
+        ylabel="detected minus reported (um)",
         title="Is a landmark where the robot says it is?",
     )
     ax.legend(loc="upper center", ncols=3)
@@ -498,7 +498,7 @@ def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: n
     for border in (2.5, 5.5, 8.5):
         right.axvline(border, color="#cccccc", linewidth=0.8)
     right.axhline(0, color="black", linewidth=0.8)
-    right.set(ylabel="estimated less true (px/mm)", title="Errors of A, three entries per pixel coordinate")
+    right.set(ylabel="estimated minus true (px/mm)", title="Errors of A, three entries per pixel coordinate")
     right.legend(loc="best", fontsize=9)
     return page
 

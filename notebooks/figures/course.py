@@ -93,7 +93,7 @@ class _Absent:
     """Replaces a table that was never recorded: every access raises LookupError."""
 
     def __getattr__(self, name: str) -> object:
-        raise LookupError("all of it")
+        raise LookupError("every row")
 
 
 @contextmanager
@@ -102,7 +102,7 @@ def recorded_table(name: str, folder: Path = paths.RESULTS) -> Iterator[results.
 
     >>> with recorded_table("never_swept") as table:
     ...     print(table.columns["error_um"].mean())
-    Left out: the recorded table never_swept lacks all of it. `python3 -m lib sweep studies/never_swept --record` records it.
+    Left out: the recorded table never_swept lacks every row. `python3 -m lib sweep studies/never_swept --record` records it.
     """
     table = results.read(name, folder)
     try:

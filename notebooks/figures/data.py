@@ -159,7 +159,7 @@ def annotation_errors(recording: Recording) -> np.ndarray:
 
 
 def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndarray]) -> Figure:
-    """Distribution of each statistic in real frames and simulated windows; the band: 5th to 95th real percentile.
+    """Distribution of each statistic in real and simulated windows; a band spans the real 5th to 95th percentile.
 
     Both arguments map a statistic to its values (n,).
     """

@@ -84,7 +84,7 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
 def _stills(
     shows: str, knobs: dict[str, DescriptionWidget], defaults: dict[str, object], png: bytes, drawn: Callable[..., bytes]
 ) -> str:
-    """HTML: pictures of a few values of each control, the others at their defaults, and a slider for each control."""
+    """HTML: pictures of a few values of each control, with the others at their defaults, and a slider for each."""
     pictures, sliders = [("default", "at the defaults", png)], []
     for name, knob in knobs.items():
         values = _some_values(knob, max(3, _STILLS // len(knobs)))

@@ -183,7 +183,7 @@ def pck_curves(
     if paper:
         ax.plot(0.05, 99.7, "D", color=COLOURS["paper"], label="paper, 1080p, PCK@0.05")
     ax.set(xscale="log", xlim=(thresholds[0], thresholds[-1]), ylim=(0, 101))
-    ax.set(xlabel="threshold, part of the tool's length", ylabel="PCK, %", title="Correct landmarks")
+    ax.set(xlabel="threshold, fraction of the tool's length", ylabel="PCK, %", title="Correct landmarks")
     ticks = [t for t in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if thresholds[0] <= t <= thresholds[-1]]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
@@ -253,7 +253,7 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     a.plot(grid, 100 * np.searchsorted(values, grid) / max(len(values), 1), color=COLOURS["ours"], label="detections")
     a.plot(grid, 100 * chdtr(2, grid), color=COLOURS["truth"], ls="--", label="if covariances are right")
     a.axvline(chdtri(2, 0.05), color=COLOURS["baseline"], lw=1, label="95 % ellipse")
-    a.set(title="Squared error by covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
+    a.set(title="Squared error over covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
     a.legend()
     labelled = ~np.isnan(evaluation.error_px)
     mean, fraction, count = reliability(evaluation.landmarks.confidence[labelled], evaluation.correct[labelled])

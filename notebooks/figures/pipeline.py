@@ -56,7 +56,7 @@ def _shade_states(ax, results: Sequence[FrameResult]) -> None:
 
 
 def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> Figure:
-    """What the pipeline knew, frame by frame: landmarks, drift statistic, distance of the tool to the surface."""
+    """Results of the pipeline, frame by frame: landmarks, drift statistic, distance of the tool to the surface."""
     page, axes = figure(3, 1, width_in=12, height_in=6.4, sharex=True, height_ratios=[1.1, 1, 1.3])
     index = [result.index for result in results]
     for ax in axes:
@@ -95,7 +95,7 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
 def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Figure:
     """Times of each stage and of the whole frame, one row each: a dot for each frame in which it ran, and the median.
 
-    The scale is logarithmic.  The first two frames, which include the warm-up, are rings.
+    The scale is logarithmic.  The first two frames, which include the warm-up, are drawn as rings.
     """
     rows = {stage: [(r.index, r.seconds[stage]) for r in results if stage in r.seconds] for stage in STAGES}
     rows["whole frame"] = [(r.index, sum(r.seconds.get(stage, 0.0) for stage in STAGES)) for r in results]

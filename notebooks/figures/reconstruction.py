@@ -323,7 +323,7 @@ def _relative_section(
     reference: dict[str, tuple[np.ndarray, str]],
     limit_um: float = 120.0,
 ) -> None:
-    """A section less a polynomial fitted to the middle surface, since a bowl of millimetres would hide micrometres."""
+    """A section minus a polynomial fitted to the middle surface, since a bowl of millimetres would hide micrometres."""
     bowl = np.polynomial.Polynomial.fit(position_mm, depths_mm[len(depths_mm) // 2], 6)
     apart = 1e3 * (points[1] - bowl(points[0]))
     ax.plot(points[0], apart, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
@@ -531,7 +531,7 @@ def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
 def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
     """Recorded CPU seconds, wall seconds and errors of `l1_solver`, `reconstruction_speed` and `matching`.
 
-    CPU seconds are right also if the machine was busy, wall seconds only if it was idle.
+    CPU seconds are also valid on a busy machine, wall seconds only on an idle one.
     """
     names = ("l1_solver", "reconstruction_speed", "matching")
     rows = [

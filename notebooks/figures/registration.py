@@ -166,7 +166,7 @@ def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
 
 
 def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figure:
-    """BIC of each hypothesis less that of the best one (left); triangulation error after each correction (right)."""
+    """BIC of each hypothesis minus that of the best one (left); triangulation error after each correction (right)."""
     page, axes = figure(1, 2, width_in=11, height_in=3.4)
     names = list(bic)
     excess = np.array([bic[name] for name in names])

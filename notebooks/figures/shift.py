@@ -71,6 +71,6 @@ def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float
         ax.plot(thresholds, curve, "o-", color=COLOURS[colour], ms=4, label=name)
     ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
     ax.set(xlim=(0.05, 0.5), ylim=(0, 101), title="Real frames")
-    ax.set(xlabel="threshold, part of the tool's length", ylabel="PCK, %")
+    ax.set(xlabel="threshold, fraction of the tool's length", ylabel="PCK, %")
     ax.legend(loc="best")
     return fig

@@ -21,7 +21,7 @@ from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
 
-#: Fewest complete rows of a calibration that held-out frames judge, and of these held-out frames.
+#: Fewest complete rows of a calibration that held-out frames judge, and fewest complete rows of these frames.
 _ROWS = (12, 3)
 #: Number of labelled stereo frames, far apart, that is enough to calibrate; reasons for doubt if there are fewer.
 _ENOUGH_LABELS = 10
@@ -203,7 +203,7 @@ def health_chart(found: Health) -> Figure:
     """The score of each frame: the strongest evidence against the detector, from the frame's landmarks and its picture."""
     page, ax = figure(height_in=2.6)
     score = np.clip(np.nan_to_num(found.score, nan=1e2), 1e-2, 1e2)
-    ax.semilogy(found.frame, score, "o", ms=4, color="#0072b2", label="worst part")
+    ax.semilogy(found.frame, score, "o", ms=4, color="#0072b2", label="score of the frame")
     low = score.min()
     if "unfamiliar" in found.parts:
         unfamiliar = np.maximum(found.parts["unfamiliar"][:, 0], 1e-2)

@@ -1,4 +1,4 @@
-"""The paper's second experiment: rendered checkerboards, reconstructed with a rig and compared with their known grid."""
+"""The paper's second experiment: render checkerboards, reconstruct them with a rig, compare with the known grid."""
 
 from __future__ import annotations
 

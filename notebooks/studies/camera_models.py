@@ -12,8 +12,8 @@ from lib.calibration.estimate import calibrate
 from lib.calibration.models import Model
 from lib.correspondences import Correspondences
 
-#: Each model -> the next more general one; a likelihood-ratio test of the two decides whether the constraint holds.  The
-#: order is from the most constrained model on.  The cameras of a pair differ in zoom, so `common_zoom` is the first to fail.
+#: Model -> the next more general one, the most constrained first; a likelihood-ratio test of the two decides whether
+#: the constraint holds.  The cameras of a pair differ in zoom, so `common_zoom` is the first to be rejected.
 _FREER = {
     "common_zoom": "square", "square": "zero_skew", "zero_skew": "affine", "affine": "affine+distance",
     "square+distance": "zero_skew+distance", "zero_skew+distance": "zero_skew+distances", "zero_skew+distances": None,

@@ -75,7 +75,7 @@ def _normalised(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangulate_perspective(cameras: Sequence[PerspectiveCamera], u: Sequence[ArrayLike]) -> np.ndarray:
-    """Points (n, 3) mm from pixels (n, 2) of each camera: linear triangulation, then again with weights by depth."""
+    """Points (n, 3) mm from pixels (n, 2) of each camera: linear triangulation, repeated with weights by depth."""
     u = [points(pixels, 2, "u") for pixels in u]
     weights = [np.ones(len(pixels)) for pixels in u]
     for _ in range(2):

@@ -70,7 +70,7 @@ def read_robot_frames(folder: str | Path) -> RobotFrames:
 
 
 def find_spheres(image: np.ndarray) -> np.ndarray | None:
-    """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px; None if not both are there.
+    """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px; None unless both are found.
 
     A red region gives a rough circle.  Along 180 rays the steepest decrease of redness gives the outline to sub-pixel
     accuracy.  A robust fit of a circle ignores the parts where the shaft, highlights or tape cross the outline.
@@ -163,7 +163,7 @@ def calibrate_sphere(
     image_size_px: tuple[int, int],
     along_shaft_mm: float | None = None,
 ) -> SphereFit:
-    """Estimate the camera and the length l of one sphere; for leave-one-out residuals both are estimated without each frame.
+    """Estimate camera and length l from one sphere; each leave-one-out residual comes from a fit without its frame.
 
     Parameters
     ----------

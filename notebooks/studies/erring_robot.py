@@ -35,7 +35,7 @@ def recorded(rung: str, recording_seed: int, pairs: int) -> tuple[Recording, np.
 
 
 def erring(recording: Recording, rng: np.random.Generator, *, offset_mm: float, clock_ms: float, missing: float) -> Recording:
-    """The recording with errors in the log: constant offsets in the tool's axes, another clock, and missing samples."""
+    """The recording with errors in the log: constant offsets in the tool's axes, a clock error, missing samples."""
     k = recording.kinematics
     offset = rng.normal(size=(3, 3))
     offset *= offset_mm / np.linalg.norm(offset, axis=1, keepdims=True)
@@ -48,7 +48,7 @@ def erring(recording: Recording, rng: np.random.Generator, *, offset_mm: float, 
 
 
 def record_gain(found: Adaptation, exact: np.ndarray, image_size_px: tuple[int, int]) -> None:
-    """Record the errors in the frames for judging: of the detector before and after, and of the robot's labels."""
+    """Record errors in the frames for judging: of the detector before and after the training, and of the labels."""
     told = exact[found.frames["judge"]].reshape(-1, 3, 2)
     inside = ((told > -0.5) & (told < np.array(image_size_px) - 0.5)).all(-1)
     length, told = tool_length_px(told), np.where(inside[..., None], told, np.nan)

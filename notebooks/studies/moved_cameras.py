@@ -20,7 +20,7 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.simulated_rows import SimulatedSweep
 from notebooks.studies.tracked import TrackedErrors
 
-#: An estimator of the motion: (stale rig, Correspondences after the motion) -> Registration.
+#: An estimator of the motion: (rig before the motion, Correspondences after it) -> Registration.
 Estimator = Callable[[StereoRig, Correspondences], Registration]
 
 
@@ -94,13 +94,13 @@ def tool_frames(
     half_size_mm:
         Half the size of the box of the base's positions in the microscope frame, within the field and depth of field.
     jaw_mm:
-        Length of the jaws, drawn once: one tool.
+        Range of the jaws' length, which is drawn once.
     opening_rad:
-        Angle between the jaws, drawn for each frame.
+        Range of the angle between the jaws, which is drawn for each frame.
     outliers:
         Share of detections that are shifted at random by up to 100 px per coordinate.
     errors:
-        Errors of a detector and their stated covariances, used instead of `sigma_u_px`; a random one for each frame.
+        Errors of a detector and their stated covariances, instead of `sigma_u_px`; a random frame's for each frame.
     """
     rig = rig or reference_rig()
     jaw = rng.uniform(*jaw_mm)
@@ -152,8 +152,8 @@ def random_motion(
 def motion_error(estimate: RigidTransform, truth: RigidTransform, centre_mm: np.ndarray) -> tuple[float, np.ndarray]:
     """Error of an estimated motion: (translation in mm, Euler angles (3,) in rad).
 
-    The translation error is that of the point that truly is at `centre_mm`, in the workspace.  At the robot's origin, which
-    may be far away, it would mainly show the rotation error.
+    The translation error is that of the point whose true position is `centre_mm`, in the workspace.  At the robot's
+    origin, which may be far away, it would mainly show the rotation error.
     """
     residual = estimate.compose(truth.inverse())
     angles = Rotation.from_matrix(residual.R).as_euler("xyz")  # the paper's Phi_X, Phi_Y, Phi_Z
@@ -206,9 +206,9 @@ def recorded_errors(
     Parameters
     ----------
     rig:
-        Calibrated with other frames than these.
+        Calibrated from other frames.
     data:
-        Landmarks of the held-out frames, detected and reported by the robot.
+        Landmarks of the held-out frames: the detections and the robot's report.
     """
     frames, centre_mm = np.unique(data.frame), np.nanmean(data.x_mm, axis=0)
     if len(frames) < max(n_frames):

@@ -1,4 +1,4 @@
-"""Are these data enough to calibrate, and where should the tool go next?"""
+"""Tests if data are enough to calibrate, and chooses where the tool should go next."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarra
 
 
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (count, 3) mm, chosen one by one, whose correspondences increase det(information) most; and the log gains.
+    """Returns positions (count, 3) mm, each chosen to increase det(information) most, and the logarithms of the gains.
 
-    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model the largest leverage is best.  It is a convex
-    function of the position, so in a box a corner is best.
+    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model the largest leverage is best.  The leverage
+    is a convex function of the position, so in a box a corner is best.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
     J_x, J = calibration.derivatives(x)

@@ -278,7 +278,7 @@ def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> list[dict[str, float | str | bool]]:
-    """A row for each statistic: 5th, 50th and 95th percentile of both; is the simulated median between the real ones?"""
+    """A row for each statistic: percentiles of both (5, 50, 95); `within`: the simulated median is in this range."""
     rows = []
     for name, values in real.items():
         row = {"name": name, "statistic": STATISTICS[name]}

@@ -71,7 +71,7 @@ class Checkerboard:
         texture[y0 : y0 + self.rows * square, x0 : x0 + self.columns * square] = np.kron(
             squares, np.ones((square, square), np.uint8)
         )
-        # Edges soft by a texel, so that sampling at about a texel a pixel keeps them in place.
+        # Soften the edges by a texel, so that sampling at about one texel per pixel keeps them in place.
         return np.repeat(cv2.GaussianBlur(texture, (0, 0), 0.7)[..., None], 3, axis=2)
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:

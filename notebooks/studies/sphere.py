@@ -49,7 +49,7 @@ def fit_sphere(x_mm: ArrayLike, *, reject_medians: float = 5.0) -> Sphere:
     mean = x.mean(axis=0)
     size = np.linalg.svd(x - mean, compute_uv=False)
     if size[2] < 1e-9 * size[0]:
-        raise ValueError("x_mm: the points lie in a plane, which no one sphere fits best.")
+        raise ValueError("x_mm: the points lie in a plane, which no single sphere fits best.")
     unit = size[0] / np.sqrt(len(x))
 
     def solve(chosen: np.ndarray) -> np.ndarray:

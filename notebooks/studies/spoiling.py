@@ -1,4 +1,4 @@
-"""Simulated correspondences of good and spoiled recordings, each with the truth that judges the workbench."""
+"""Simulated correspondences of good and spoiled recordings, with the truth that judges the workbench's results."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _SIZE = (1920, 1080)
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A recording without its images: the data of a lab, and their truth.
+    """A recording without its images: the data that a lab has, and their truth.
 
     Attributes
     ----------
     name, strength, causes:
         The fault and its strength ("" if there is none), and the names of the hypotheses that are right.
     data, kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm:
-        The data of the lab.
+        The data that the lab has.
     rigs, points_mm:
         The true rigs (more than one if a camera moved) and (k, 3) test positions, in the true robot frame.
     """
@@ -61,13 +61,13 @@ class Scene:
     noise_px: float = 1.2
     tail: float = np.inf  # degrees of freedom (Student t) of the detections' errors
     memory: float = 0.0  # correlation of these errors from frame to frame
-    shared: float = 0.0  # and between the landmarks of an image
+    shared: float = 0.0  # correlation of these errors between the landmarks of an image
     anisotropy: float = 1.0  # ratio of the errors along the image rows to those across them, with the same RMS
     bias_mm: float = 0.0  # constant offsets of the detected landmarks
-    missing: float = 0.0
-    outliers: float = 0.0
+    missing: float = 0.0  # share of the detections that are missing
+    outliers: float = 0.0  # share of the detections that are at random places
     stated: bool = True  # the detector states covariances
-    robot_mm: float = 0.008
+    robot_mm: float = 0.008  # noise of the robot's report, per coordinate
     readout_s: float = 0.012
     inverse_distance_per_mm: float = 0.0
     opening_mm: tuple[float, float] = (0.3, 1.4)
@@ -654,10 +654,10 @@ GOOD: dict[str, dict[str, object]] = {
 
 
 def takes(recordings: str = "setting", seed: int = 0, only: str = "", distance_mm: float = np.inf) -> Iterator[Take]:
-    """The good and then the spoiled recordings of one set whose names contain `only`.
+    """First the good, then the spoiled recordings of a set, if their names contain `only`.
 
-    The `seed` is that of all rigs, tools, paths and noise.  The microscopes have a working distance of `distance_mm`.  If it
-    is finite, the recordings whose only fault is a finite distance are left out.
+    `seed` determines all rigs, tools, paths and noise.  The microscopes have a working distance of `distance_mm`.  If
+    it is finite, the recordings whose only fault is a finite distance are left out.
     """
     for i, (name, options) in enumerate(GOOD.items()):
         if only in name:

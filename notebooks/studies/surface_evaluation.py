@@ -93,7 +93,7 @@ def surface_on_rays(
 ) -> np.ndarray:
     """Points (n, 3) mm, robot frame, in which rays of pixels u (n, 2) meet z = `height_mm(x, y)` of the microscope frame.
 
-    The view is nearly the microscope's axis, so steps along the ray by the remaining height converge fast.
+    The view is nearly parallel to the microscope's axis, so steps along the ray by the remaining height converge fast.
     """
     ray = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
     along = np.full(len(u), float(camera.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))

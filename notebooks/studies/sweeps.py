@@ -63,7 +63,7 @@ def label_rows(recording: Recording, *, click_px: float, seed: int = 0) -> Corre
 
 
 def estimate(rows: Correspondences, estimator: str, **options: object) -> Calibration:
-    """Calibrate from detections by one of `ESTIMATORS`; `options` as in `calibrate`."""
+    """Calibrate from detections with one of `ESTIMATORS`; `options` as in `calibrate`."""
     offsets, weighed = ESTIMATORS[estimator]
     if not weighed:
         rows = replace(rows, covariance_px2=np.full_like(rows.covariance_px2, np.nan))
@@ -72,7 +72,7 @@ def estimate(rows: Correspondences, estimator: str, **options: object) -> Calibr
 
 @dataclass(frozen=True)
 class Judgement:
-    """A calibration against the truth of a simulated recording.
+    """Errors of a calibration, measured by the truth of a simulated recording.
 
     The bounds are Cramer-Rao predictions: the covariance of the fitted model's parameters at the true cameras and
     positions of the rows used, for independent Gaussian noise of `sigma_u_px` in every pixel coordinate and of the robot's

@@ -60,7 +60,7 @@ class TrackedErrors:
 def tracked_errors(
     scenes: int = 8, *, parts: int = 3, frames: int = 32, seed: int = 40, detector: Detector | None = None
 ) -> TrackedErrors:
-    """Errors of a detector that follows the tools of `scenes` eyes, from the cache or rendered (0.2 s of processor a frame).
+    """Errors of a detector that follows the tools of `scenes` eyes, from the cache or rendered (0.2 CPU s a frame).
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def _followed(detector: Detector, seed: int, parts: int, frames: int) -> Iterato
             true, origin = np.array(true), np.array(origin)[:, None]
             lost = before is None or not (np.linalg.norm(before.u - origin - true, axis=2) < _LOST_PX).all()
             lost = lost or (before.confidence < TRACKED_FROM).any()
-            # The search of a whole frame is replaced by the truth plus an error of a few pixels.
+            # Instead of a search of the whole frame, start from the truth plus an error of a few pixels.
             u = true + rng.normal(0, 3.0, true.shape) if lost else before.u - origin
             near = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
             found = detector.track(np.stack(images), near, min_confidence=0.0)
