@@ -26,7 +26,7 @@ from lib.workbench.execution import Failure, execute
 
 #: A file that reserves space, so that a run can write its last state when the disk is full.
 _ROOM = ".room"
-#: The most notebooks that run at once if the command does not say how many: each may need 3 GB of memory.
+#: The most notebooks that run at once if the command does not say how many; one may need 4 GB of memory.
 _AT_ONCE = 4
 
 
