@@ -301,7 +301,7 @@ class Detector:
     def near(self, images: np.ndarray, u: np.ndarray, *, ground: _Ground = None, reach: float | None = None) -> Landmarks:
         """Detect by the later stages alone, in images (n, h, w, 3) at expected positions u (n, 3, 2) px; NaN = unknown.
 
-        Detections farther away than `NEAR` count as missing.  With `reach`, a share of the tool's length, only peaks within it
+        Detections farther away than `NEAR` are missing.  With `reach`, a share of the tool's length, only peaks within it
         count, even if another point of an unknown tool looks more like the landmark.  `ground` as in a call.
         """
         known = np.isfinite(u).all(axis=2)

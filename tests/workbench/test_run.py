@@ -396,7 +396,7 @@ def test_who_waits_to_run_alone_is_not_overtaken():
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 def test_a_stopped_run_ends_its_kernels(write_notebook, tmp_path):
     for name in ("00_first", "01_second"):
-        write_notebook(tmp_path, name, "import os, pathlib, time\npathlib.Path(f'{os.getpid()}.pid').touch(); time.sleep(300)")
+        write_notebook(tmp_path, name, "import os, pathlib, time; pathlib.Path(f'{os.getpid()}.pid').touch(); time.sleep(99)")
     code = """
 import os, sys
 from pathlib import Path
