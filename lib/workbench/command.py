@@ -98,12 +98,11 @@ def run(
         with places.taken() as begin:
             start = time.monotonic()
             report.begin(number)
-            limits = {"cell_timeout_s": cell_timeout_s, "begin": begin}
-            failure = execute(book, report.folder / book.name, values[book], label=label, **limits)
-            if places.closed:
+            options = {"cell_timeout_s": cell_timeout_s, "label": label, "begin": begin}
+            failure = execute(book, report.folder / book.name, values[book], **options)
+            if places.closed:  # the run was stopped, so it is no failure of the notebook
                 return
-            seconds = time.monotonic() - start
-            report.end(number, failure, seconds)
+            report.end(number, failure, seconds := time.monotonic() - start)
             with tqdm.external_write_mode():
                 print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
 
@@ -181,7 +180,7 @@ class _Report:
             "verdict": None, "reasons": [], "metrics": [], "figures": [], "download": None,
         }  # fmt: skip
         self.content["previous"] = previous_values(folder.parent, self.content)
-        self._lock = threading.RLock()  # several notebooks may begin and end at once
+        self._lock = threading.Lock()  # several notebooks may begin and end at once
         (folder / "figures").mkdir()
         (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()

@@ -158,9 +158,9 @@ class Places:
 
     @contextmanager
     def taken(self) -> Iterator[Callable[[nbformat.NotebookNode], None]]:
-        """Hold a place during the block; what this yields must be called before each code cell, and waits for its turn.
+        """Hold a place during the block, and yield a function that waits for the turn of a code cell.
 
-        It raises a RuntimeError once the places are `closed`.
+        Call it before each code cell.  It raises a RuntimeError once the places are `closed`.
         """
         held = 0
 
