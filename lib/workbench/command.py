@@ -247,8 +247,8 @@ class _Report:
 
     def write(self) -> None:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
-        files.write_json(self.folder / "metrics.json", self.content)
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
+        files.write_json(self.folder / "metrics.json", self.content)  # last: who reads it finds a page as new
 
 
 def _new_folder(runs: Path, profile: str) -> Path:

@@ -313,7 +313,7 @@ def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_pa
 
 
 def test_a_killed_run_leaves_a_report_and_the_next_its_own(books, without_kernels, tmp_path):
-    """kill -9 while the second of two notebooks runs."""
+    """kill -9 while the second of two notebooks runs, as soon as metrics.json says so: the page says it too."""
     code = """
 import shutil, sys, time
 from pathlib import Path
@@ -323,7 +323,11 @@ def execute(book, output, values, **options):
     time.sleep(60 if book.stem == "02_dead" else 0)
     shutil.copy(book, output)
 
-command.execute = execute
+def slow_page(content, page=command.pages.index_html):
+    time.sleep(0.3)
+    return page(content)
+
+command.execute, command.pages.index_html = execute, slow_page
 command.run(["00", "02"], runs=Path(sys.argv[1]), notebooks=Path(sys.argv[2]))
 """
     words = [sys.executable, "-c", code, str(tmp_path), str(books)]
