@@ -18,7 +18,7 @@ SMALLEST = {
     "ground": {"pairs": 4},
     "l1_solver": {"n_points": 2000, "control": 20},
     "label_noise": {"steps": 100},
-    "left_out": {"minutes": 0.02, "n": 2},
+    "left_out": {"steps": 4, "n": 2},
     "matching": {"scene": "eye", "repeats": 1},
     "noise_and_coverage": {"runs": 4},
     "noticed_motion": {"recordings": 1, "before": 60, "after": 10, "scenes": 1},
