@@ -31,7 +31,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 24  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 25  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -295,7 +295,7 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         if by_hand is None:  # else the labels tell where the base is
-            sine = tilt(recording.landmarks_mm()[learn], teacher.calibration.cameras)
+            sine = tilt(teacher.recording.landmarks_mm()[learn], teacher.calibration.cameras)
             self.shaft = shaft_end(recording, learn, u, sine)
             moved, teacher = teacher, teacher.with_base(self.shaft)
             self.report["base_moved_mm"] = float(teacher.offset_mm[0, 0] - moved.offset_mm[0, 0])

@@ -83,9 +83,9 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
     Args:
         frames: Numbers (m,) of the frames.
         u: Base and tips (m, 2, 3, 2) px in them, of which the base may be off along the tool.
-        sine: Of the angle between tool and image (m, 2), by `tilt`.
+        sine: Of the angle between tool and image (m, 2), by `tilt`; images where it is NaN are left out.
     """
-    aligned = _aligned(recording, frames, u)
+    aligned = _aligned(recording, frames, np.where(np.isfinite(sine)[:, :, None, None], u, np.nan))
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
     scores, sines = [], []

@@ -66,6 +66,16 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     assert np.abs(middle - 70).max() < 4  # the outline lies around the tool's axis, which is the row of the label
 
 
+def test_frames_in_which_the_robot_is_silent_are_left_out():
+    u = tools(0.5)
+    labels, recording, sine = u.copy(), pictured(u, 0.5), np.full((len(FRAMES), 2), 0.5)
+    labels[:, :, 0] += 0.1 * (u[:, :, 1:].mean(axis=2) - u[:, :, 0])
+    alone, again = shaft_end(recording, FRAMES, labels, sine), np.append(FRAMES, [3, 8])
+    silent = np.concatenate([sine, np.full((2, 2), np.nan)])  # without a report the tilt is unknown
+    found = shaft_end(recording, again, labels[again], silent)
+    assert found.moved == alone.moved and np.array_equal(found.u[: len(FRAMES)], alone.u)
+
+
 @pytest.mark.parametrize("left_out", ["tool", "shaft", "edges", "frames"])
 def test_pictures_that_show_no_end_of_a_shaft_give_none(left_out):
     u, frames = tools(0.4), FRAMES[: 8 if left_out == "frames" else None]
