@@ -111,9 +111,13 @@ def test_the_digest_changes_with_notebook_and_code(write_notebook, tmp_path, mon
     digests = [sweeping._code_digest(book)]
     (tmp_path / "lib" / "code.py").write_text("a = 2")
     digests.append(sweeping._code_digest(book))
+    (tmp_path / "lib" / "template.html").write_text("a = 3")
+    digests.append(sweeping._code_digest(book))
+    (tmp_path / "lib" / "code.pyc").write_bytes(b"compiled")
+    assert sweeping._code_digest(book) == digests[-1]
     write_notebook(tmp_path, "study", "2")
     digests.append(sweeping._code_digest(book))
-    assert len(set(digests)) == 3
+    assert len(set(digests)) == 4
 
 
 def test_what_cannot_run_is_told_in_one_line(write_notebook, tmp_path, capsys):
