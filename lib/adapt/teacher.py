@@ -67,8 +67,7 @@ _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
 #: Largest distance of the measured end of the shaft from the label, in standard deviations; a farther one is another edge.
 _ANOTHER_EDGE = 3.0
-#: Standard deviation of a label of the base along a tool that the detector knows, as a share of the tool's length: 0.0042 RMS
-#: on twelve recordings, also by two other renderers.
+#: Error of the base's label along a tool that the detector knows, as a share of its length; twelve recordings: 0.0042 RMS.
 _KNOWN_BASE = 0.005
 _OTHER_POINT = 0.3  # prior sd of the offset from a detector's point to the labelled one, as a share of the tool's length
 LABEL = (
@@ -160,8 +159,8 @@ class Teacher:
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
         """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.
 
-        Either the detector knows the tool, and its labels are better than the end, or they err as they state.  Both are
-        equally likely before; the size of the shift tells which, and the mean over the two is taken.
+        If the detector knows the tool, its label is better than the end; if not, the label errs as it states.  Both are
+        equally likely beforehand.  The size of the shift changes the odds, which weigh the corrections of the two cases.
         """
         if end is None:
             return self

@@ -248,7 +248,7 @@ class _Report:
     def write(self) -> None:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
-        files.write_json(self.folder / "metrics.json", self.content)  # last: who reads it finds a page as new
+        files.write_json(self.folder / "metrics.json", self.content)  # last, so that the page is never older than it
 
 
 def _new_folder(runs: Path, profile: str) -> Path:

@@ -185,8 +185,9 @@ def _cost(executed: Iterable[Path]) -> dict:
 
 def _code_digest(book: Path) -> str:
     """Digest of all that determines the rows: the notebook, the helpers of all notebooks, lib and the weights that ship."""
-    code = {*book.parent.glob("*.py"), *paths.NOTEBOOKS.rglob("*.py"), *(paths.ROOT / "lib").rglob("*.*[!c]")}  # not .pyc
-    return files.digest(book, *sorted(code | {*paths.MODELS.glob("*.safetensors")}), length=8)
+    own = (file for file in (paths.ROOT / "lib").rglob("*") if file.is_file() and file.suffix != ".pyc")
+    code = {*book.parent.glob("*.py"), *paths.NOTEBOOKS.rglob("*.py"), *paths.MODELS.glob("*.safetensors"), *own}
+    return files.digest(book, *sorted(code), length=8)
 
 
 def _label(point: dict) -> str:

@@ -114,6 +114,7 @@ def test_the_digest_changes_with_notebook_and_code(write_notebook, tmp_path, mon
     (tmp_path / "lib" / "template.html").write_text("a = 3")
     digests.append(sweeping._code_digest(book))
     (tmp_path / "lib" / "code.pyc").write_bytes(b"compiled")
+    (tmp_path / "lib" / ".ipynb_checkpoints").mkdir()  # JupyterLab makes it
     assert sweeping._code_digest(book) == digests[-1]
     write_notebook(tmp_path, "study", "2")
     digests.append(sweeping._code_digest(book))
