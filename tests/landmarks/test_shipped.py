@@ -66,6 +66,19 @@ def test_a_tool_is_found_where_it_is_expected_and_nowhere_else(shipped):
     assert np.isnan(shipped.default.near(shipped.images[:2], expected).u[0]).all()
 
 
+def test_near_an_expected_place_the_surer_of_image_and_difference_from_the_ground_counts(shipped):
+    image, expected = shipped.images[0], shipped.by_default.u[:1] + 5.0
+    pattern = np.random.default_rng(0).integers(60, 190, (68, 120, 3), dtype=np.uint8)
+    pattern = cv2.resize(pattern, image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    dull = cv2.addWeighted(image, 0.4, cv2.medianBlur(image, 255), -0.4, 0.0, dtype=cv2.CV_16S)
+    dull = cv2.add(pattern, dull, dtype=cv2.CV_8U)[None]  # a dull tool on a strong pattern
+    bare, both = shipped.default.near(dull, expected), shipped.default.near(dull, expected, ground=lambda: pattern[None])
+    assert bare.confidence.mean() < 0.5 < both.confidence.mean()
+    assert np.linalg.norm(both.u - shipped.by_default.u[:1], axis=2).max() < 0.02 * tool_length_px(shipped.u[:1]).mean()
+    same = shipped.default.near(image[None], expected, ground=lambda: image[None])  # a ground that contains the tool
+    assert np.array_equal(same.u, shipped.default.near(image[None], expected).u)
+
+
 def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
     both = np.stack([shipped.images[0], cv2.resize(ground, shipped.images.shape[2:0:-1])])
