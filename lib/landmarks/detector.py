@@ -302,14 +302,14 @@ class Detector:
         """Detect by the later stages alone, in images (n, h, w, 3) at expected positions u (n, 3, 2) px; NaN = unknown.
 
         Detections farther away than `NEAR` are missing.  With `reach`, a share of the tool's length, only peaks within it
-        count.  With `ground`, as in a call, each landmark is that of the image or of its difference, whichever is surer.
+        count.  With `ground`, as in a call, each landmark is that of the image or of the levelled image, the surer.
         """
         known = np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
         u = np.where(known[..., None], u, np.nan)
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))
         # A window shows the whole tool.  With closeups alone, their constant error would add up if the caller repeats this.
-        for stage in (stage for stage in self.stages if stage in ("again", "closeup", "closer")):
+        for stage in [stage for stage in self.stages if stage in ("again", "closeup", "closer")]:
             found = self.refine(images, found, stage, reach=reach)
         found.confidence[found.away(u)] = 0.0
         if ground is not None:
