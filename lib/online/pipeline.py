@@ -17,6 +17,7 @@ from lib.calibration import Calibration, calibrate_as_shown
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
 from lib.landmarks import Landmarks, with_ground
+from lib.landmarks.contrast import levelled
 from lib.online.checks import FrameChecks
 from lib.online.distance import Surface, TipDistance
 from lib.online.result import FrameResult, Settings
@@ -206,12 +207,13 @@ class OnlinePipeline:
 
     def _guided(self, images: np.ndarray, found: Landmarks, robot_px: np.ndarray | None, known: dict) -> Landmarks:
         """`found`; images in which it is in doubt or far from `robot_px` are searched again near `robot_px`."""
-        lost = [] if robot_px is None else np.flatnonzero(found.doubtful | found.away(robot_px).any(axis=1))
-        if len(lost):
-            ground = known.get("ground")
-            near = self._detector.near(images[lost], robot_px[lost], ground=ground and (lambda: ground()[lost]))
-            found = Landmarks.join([found])  # a copy
-            found.put(lost[~near.doubtful], near[~near.doubtful])
+        found, ground = Landmarks.join([found]), known.get("ground")  # a copy
+        for differs in (False, True)[: 1 + bool(ground)]:  # the difference from the ground takes longer
+            lost = [] if robot_px is None else np.flatnonzero(found.doubtful | found.away(robot_px).any(axis=1))
+            if len(lost):
+                shown = [levelled(images[i], ground()[i]) if differs else images[i] for i in lost]
+                near = self._detector.near(np.stack(shown), robot_px[lost])
+                found.put(lost[~near.doubtful], near[~near.doubtful])
         return found
 
     def _robot_px(self, paired: Callable[..., Correspondences]) -> np.ndarray | None:

@@ -225,7 +225,7 @@ def test_a_detector_that_takes_another_tool_looks_where_the_robot_says():
             found = world.detect(images)
             return replace(found, u=found.u + [150.0, 90.0]) if world.frame >= 20 else found
 
-        def near(self, images, u, *, ground):
+        def near(self, images, u):
             asked.append((world.frame, u))
             return world.detect(images)
 
@@ -234,6 +234,24 @@ def test_a_detector_that_takes_another_tool_looks_where_the_robot_says():
     assert [frame for frame, _ in asked] == list(range(20, 30))
     told = np.stack(world.rig.project(world.x_mm[29]))
     assert np.abs(asked[-1][1] - told).max() < 15 and np.abs(results[-1].landmarks.u_left - told[0]).max() < 6
+
+
+@pytest.mark.parametrize("finds", [True, False])
+def test_the_difference_from_the_ground_is_searched_only_if_the_image_shows_nothing_near_the_robot(monkeypatch, finds):
+    """The difference takes longer than all else that the detector does."""
+    world, differences = World(3), []
+    monkeypatch.setattr("lib.online.pipeline.levelled", lambda image, ground: differences.append(world.frame) or image)
+
+    class Losing(SharedDetector):
+        def __call__(self, images, *, ground=None):
+            return world.detect(images) if world.frame < 20 else Landmarks.none(2)
+
+        def near(self, images, u):
+            return world.detect(images) if finds or world.frame in differences else Landmarks.none(2)
+
+    results = run(make(world, detector=Losing(world.detect), settings=SELDOM), world, 30)
+    assert all(r.state == "tracking" for r in results[8:])
+    assert sorted(set(differences)) == ([] if finds else list(range(20, 30)))
 
 
 def test_a_push_is_noticed_by_the_detector_that_ships():
@@ -262,7 +280,7 @@ def test_where_the_robot_says_allows_for_the_landmarks_offsets():
             found = world.detect(images)
             return Landmarks.none(2) if world.frame >= 30 else found
 
-        def near(self, images, u, *, ground):
+        def near(self, images, u):
             asked.append(u)
             return world.detect(images)
 
