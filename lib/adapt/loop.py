@@ -19,7 +19,7 @@ from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
 from lib.landmarks.metrics import tool_length_px
-from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
+from lib.landmarks.shaft import ShaftEnd, shaft_axis, shaft_end
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording, read_image, smoothed
 from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
@@ -51,6 +51,7 @@ _SURE_GAIN = 1.0
 #: Most rounds of detection near the robot's landmarks before any training, and the share of the tool's length by which the
 #: robot's landmarks must move for another such round.
 _GUIDED, _SETTLED = 3, 0.01
+_ANGLED = np.cos(np.radians(12.0))  # the jaws are angled if the cosine between shaft and tips is smaller
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
 _UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which it asks for clicks
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
@@ -180,6 +181,7 @@ class _Work:
         self.minutes, self.saved_s = minutes, 0.0
         self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
         self.shaft: ShaftEnd | None = None
+        self.axis: np.ndarray | None = None  # of the shaft, in the tool's axes
         self.simulated: list[LabelledImage] = []  # simulated frames in the colours of this recording
         self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
@@ -280,7 +282,7 @@ class _Work:
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untrained, near the robot's landmarks
-            guided = self.look(f"guided {k}", start, learn, u)
+            guided = self.near(f"guided {k}", start, learn, teacher)
             try:
                 found = teach(recording, guided.labelled(few), opinion=guided, before=teacher, by_hand=by_hand)
             except RefusalError:
@@ -295,10 +297,11 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         if by_hand is None:  # else the labels tell where the base is
-            sine = tilt(teacher.recording.landmarks_mm()[learn], teacher.calibration.cameras)
-            self.shaft = shaft_end(recording, learn, u, sine)
+            where = recording, learn, u[:, :, 0], teacher.axes_px(learn)
+            self.shaft = shaft_end(*where, shaft_axis(*where))
             moved, teacher = teacher, teacher.with_base(self.shaft)
-            self.report["base_moved_mm"] = float(teacher.offset_mm[0, 0] - moved.offset_mm[0, 0])
+            shift_mm = teacher.offset_mm[0] - moved.offset_mm[0]
+            self.report["base_moved_mm"] = 0.0 if self.shaft is None else float(shift_mm @ self.shaft.axis)
         self.report["refused_frames"] = teacher.refused
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
@@ -327,6 +330,21 @@ class _Work:
             if last:
                 break
         return self.judged(first, best, best_seen, teacher)
+
+    def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:
+        """Detections near the robot's landmarks; if the jaws are angled, those of the base in windows along the shaft."""
+        u = teacher.labels(frames)[0]
+        seen, axes = self.look(name, detector, frames, u), teacher.axes_px(frames)
+        if self.axis is None:
+            self.axis = shaft_axis(self.recording, frames, u[:, :, 0], axes)
+        if self.axis[0] > _ANGLED:
+            return seen
+        along = axes @ self.axis
+        aside = 0.2 * along[..., ::-1] * [1, -1]
+        straight = u[:, :, :1] + np.stack([0 * along, along + aside, along - aside], axis=2)
+        other = self.look(f"{name} along the shaft", detector, frames, straight)
+        parts = (np.concatenate([new[:, :, :1], old[:, :, 1:]], axis=2) for new, old in zip(other[1:], seen[1:], strict=True))
+        return Seen(seen.frame, *parts)
 
     def contradicted(self, teacher: Teacher) -> bool:
         """True if a teacher's landmarks are too far from labels set by hand."""

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from lib.adapt.looking import Seen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
-from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, tool_axes
+from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, shown_axes, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
@@ -156,6 +156,10 @@ class Teacher:
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
         return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
 
+    def axes_px(self, frames: np.ndarray) -> np.ndarray:
+        """The images (m, 2, 2, 3) px of the tool's axes in some frames, each axis as long as the tool."""
+        return shown_axes(self.recording.landmarks_mm()[frames], self.calibration.cameras)
+
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
         """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.
 
@@ -165,8 +169,7 @@ class Teacher:
         if end is None:
             return self
         u, covariance = self.project(end.frame)
-        axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
-        along = axis / (axis**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
+        along = end.along / (end.along**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
         shift = np.nanmedian(((end.u - u[:, :, 0]) * along).sum(axis=-1))
         variance = [_KNOWN_BASE**2, np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))]
         total = np.add(variance, end.sd**2)
@@ -175,8 +178,9 @@ class Teacher:
         gain, odds = variance / total, np.exp(-(shift**2) / (2 * total)) / np.sqrt(total)
         mean, square = (np.average(value, weights=odds) for value in (gain, gain**2))
         length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
-        offset[0, 0] += mean * shift * length_mm
-        own[0, 0, 0] = min(own[0, 0, 0], (mean * end.sd**2 + (square - mean**2) * shift**2) * length_mm**2)
+        offset[0] += mean * shift * length_mm * end.axis
+        variance = (mean * end.sd**2 + (square - mean**2) * shift**2) * length_mm**2
+        own[0] -= max(0.0, end.axis @ own[0] @ end.axis - variance) * np.outer(end.axis, end.axis)
         return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ mean, whose width the data choose (empirical Bayes).  Directions that the data d
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -21,6 +21,7 @@ from scipy.special import chdtrc
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.robust import CompetingCamerasError, LooseCameraError
 from lib.calibration.scatter import sandwich
+from lib.cameras import AffineCamera, NearAffineCamera
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import cross
 
@@ -147,6 +148,17 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
         turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
         found[shut] = turn.as_matrix() @ axes[nearest]
     return found
+
+
+def shown_axes(x_mm: np.ndarray, cameras: Sequence[AffineCamera | NearAffineCamera]) -> np.ndarray:
+    """The images (m, k, 2, 3) px, by k cameras, of the axes of tools at x_mm (m, 3, 3), in order of time.
+
+    Each axis is as long as the tool is usually.  If the jaws are always shut, only the first axis is known; the others are 0.
+    """
+    along, axes = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], carried(tool_axes(x_mm), x_mm)
+    size = np.linalg.norm(along, axis=1)
+    axes = (along / size[:, None])[:, :, None] * [1.0, 0.0, 0.0] if np.isnan(axes).all() else axes
+    return np.einsum("cij,mjk->mcik", [camera.linear for camera in cameras], np.nanmedian(size) * axes)
 
 
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:

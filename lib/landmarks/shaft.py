@@ -5,16 +5,17 @@ the same distance.  But the base is where the jaws leave the shaft, on its axis,
 landmarks align the frames; in their mean the tool stays and the ground fades.  The shaft is a cylinder that ends flat.  Its
 end appears as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between
 shaft and image.  So the outline is two lines, parallel or tapered, and the half of the ellipse on the side of the tips.
+
+The jaws may be angled.  Then the shaft does not point to the tips, but its direction in the tool's axes is the same in all
+frames: the one along which the mean of the aligned frames shows the sharpest sides.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera, NearAffineCamera
-from lib.landmarks.windows import cut, tool_pose, window_from_image
+from lib.landmarks.windows import cut, window_from_image
 from lib.recordings import Recording
 from lib.recordings.annotations import inside
 
@@ -39,6 +40,10 @@ _LARGE = 0.75
 #: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  It
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
+AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
+#: Search of the shaft's direction: side of the pictures and the part of them behind the base (width, height), at half the scale
+#: of `_SIZE_PX`; largest angle from the direction of the tips; factor by which the best energy must exceed the median.
+_AROUND_PX, _BEHIND_PX, _WIDEST_DEG, _SHARP = 121, (38, 71), 64, 3.0
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: five recordings by other renderers and on validation recordings.
 _SD, _SD_PX = 0.011, 1.0
@@ -50,6 +55,8 @@ class ShaftEnd(NamedTuple):
     Attributes:
         frame: Numbers (m,) of the frames.
         u: The base (m, 2, 2) px in both images; NaN where it is unknown.
+        axis: Unit vector (3,) along the shaft towards the tips, in the tool's axes.
+        along: The image (m, 2, 2) px of a step along `axis` that is as long as the tool.
         moved, sd: Shift from the given base towards the tips, and its standard deviation: shares of the tool's length.
         pictures: Means of the aligned pictures (2, 141, 161, 3) uint8 of left and right.
         outline: Points (2, n, 2) px of the fitted outline in them.
@@ -57,35 +64,90 @@ class ShaftEnd(NamedTuple):
 
     frame: np.ndarray
     u: np.ndarray
+    axis: np.ndarray
+    along: np.ndarray
     moved: float
     sd: float
     pictures: np.ndarray
     outline: np.ndarray
 
 
-def tilt(x_mm: np.ndarray, cameras: Sequence[AffineCamera | NearAffineCamera]) -> np.ndarray:
-    """Sine (m, k) of the angle between the tool with landmarks x_mm (m, 3, 3) and the images of k cameras.
+def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """The unit vector (3,) along the shaft towards the tips, in the tool's axes; `AHEAD` if no direction is clear.
 
-    It is positive if the tool points away from the camera, and NaN where a landmark is unknown.
-
-    >>> tool = [[[0.0, 0.0, 0.0], [3.0, 1.0, 4.0], [3.0, -1.0, 4.0]]]
-    >>> tilt(np.array(tool), [AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])]).tolist()
-    [[0.8]]
+    Arguments as of `shaft_end`.  Behind the base the mean of the frames, each turned so that the shaft points right, is
+    averaged along the rows.  If all frames are turned rightly, the sides of the shaft are steep steps of this profile.
     """
-    along = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
-    views = np.stack([camera.viewing_direction for camera in cameras], axis=1)
-    return along @ views / np.linalg.norm(along, axis=1, keepdims=True)
+    views = []
+    for side, length in enumerate(np.nanmedian(_facing(axes), axis=0)):
+        shown = np.isfinite(base[:, side]).all(axis=1) & np.isfinite(axes[:, side]).all(axis=(1, 2))
+        shown = np.flatnonzero(shown & inside(base[:, side], recording.image_size_px))
+        matrices = window_from_image(base[shown, side], np.zeros(len(shown)), _AROUND_PX, 0.5 * _LENGTH_PX / length)
+        images = ((recording.frames[int(k)].left, recording.frames[int(k)].right)[side] for k in frames[shown])
+        pairs = zip(images, matrices, strict=True)
+        pictures = np.array([cut(*pair, _AROUND_PX, border=cv2.BORDER_REPLICATE) for pair in pairs], np.float32)
+        if len(shown) < _GROUPS * _FEWEST:
+            return AHEAD
+        pictures -= pictures.mean(axis=(1, 2), keepdims=True)
+        views.append((pictures / np.maximum(pictures.std(axis=(1, 2, 3), keepdims=True), 1.0), axes[shown, side]))
+
+    def steps(direction: np.ndarray) -> float:
+        """Energy of the steps of the mean profile across the shaft, if this is its direction."""
+        energy, (wide, high) = 0.0, _BEHIND_PX
+        for pictures, shown in views:
+            x, y = np.moveaxis(shown @ direction / np.linalg.norm(shown @ direction, axis=1, keepdims=True), 1, 0)
+            turns = np.moveaxis(np.array([[x, -y], [y, x]]), 2, 0)
+            corners = turns @ [-8.0 - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            turned = (cv2.warpAffine(picture, np.column_stack(to), (wide, high), flags=flags)
+                      for picture, *to in zip(pictures, turns, corners, strict=True))
+            profile = cv2.GaussianBlur((sum(turned) / len(pictures)).mean(axis=1), (1, 3), 0.8)
+            energy += float((np.diff(profile, axis=0) ** 2).sum())
+        return energy
+
+    directions = _around(AHEAD, np.radians(np.arange(0, _WIDEST_DEG + 1, 8.0)))
+    energy = np.array([steps(direction) for direction in directions])
+    best, usual = directions[energy.argmax()], np.median(energy)
+    for angle in np.radians([4.0, 2.0, 1.0]):
+        directions = _around(best, np.array([0.0, angle]))
+        energy = np.array([steps(direction) for direction in directions])
+        best = directions[energy.argmax()]
+    return best if energy.max() > _SHARP * usual else AHEAD
 
 
-def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.ndarray) -> ShaftEnd | None:
+def _around(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) at these angles from a direction; on each circle they are about as far apart as the circles."""
+    beside = np.linalg.svd(direction[None])[2][1:]
+    found = [direction]
+    for angle in angles[1:]:
+        turn = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * np.sin(angle) / angles[1])), endpoint=False)
+        found += list(np.cos(angle) * direction + np.sin(angle) * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ beside)
+    return np.array(found)
+
+
+def _facing(axes: np.ndarray) -> np.ndarray:
+    """Length (m, k) px of a tool that lies in the image plane."""
+    size = np.full(axes.shape[:2], np.nan)
+    known = np.isfinite(axes).all(axis=(2, 3))
+    size[known] = np.linalg.svd(axes[known], compute_uv=False)[:, 0]
+    return size
+
+
+def shaft_end(
+    recording: Recording, frames: np.ndarray, base: np.ndarray, axes: np.ndarray, axis: np.ndarray = AHEAD
+) -> ShaftEnd | None:
     """Measure where the shaft ends, or return None if the pictures do not show it clearly.
 
     Args:
         frames: Numbers (m,) of the frames.
-        u: Base and tips (m, 2, 3, 2) px in them, of which the base may be off along the tool.
-        sine: Of the angle between tool and image (m, 2), by `tilt`; images where it is NaN are left out.
+        base: Where the base is expected (m, 2, 2) px in them; it may be off along the shaft.
+        axes: The images (m, 2, 2, 3) px of the tool's axes, each as long as the tool; images where it is NaN are left out.
+        axis: Unit vector (3,) along the shaft towards the tips, in the tool's axes, by `shaft_axis`.
     """
-    aligned = _aligned(recording, frames, np.where(np.isfinite(sine)[:, :, None, None], u, np.nan))
+    along = axes @ axis
+    size = np.linalg.norm(along, axis=-1)
+    sine = np.sqrt((1 - (size / _facing(axes)) ** 2).clip(0, _STEEPEST**2))
+    aligned = _aligned(recording, frames, base, along)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
     scores, sines = [], []
@@ -93,7 +155,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
         even = pictures - pictures.mean(axis=(1, 2), keepdims=True)
         even /= np.maximum(even.std(axis=(1, 2, 3), keepdims=True), 1.0)
-        sines.append(np.abs([sine[kept[group], side].mean() for group in groups]).clip(0, _STEEPEST))
+        sines.append(np.array([sine[kept[group], side].mean() for group in groups]))
         scores.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
     clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
     best = clear.max(axis=(0, 1))
@@ -107,28 +169,29 @@ def shaft_end(recording: Recording, frames: np.ndarray, u: np.ndarray, sine: np.
     if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST:
         return None
     before, at, after = best[i - 1 : i + 2]
-    along = _ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)
+    moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
     outlines = []
     for score, angle in zip(own, sines, strict=True):
         mean = angle.mean(keepdims=True)
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
-        outlines.append(points + _MIDDLE_PX + [along, _ACROSS_PX[score.argmax()]])
-    axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
-    sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(np.linalg.norm(axis, axis=-1))))
+        outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, _ACROSS_PX[score.argmax()]])
+    sd = float(np.hypot(_SD, _SD_PX / np.nanmedian(size)))
     means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)
-    return ShaftEnd(frames, u[:, :, 0] + along / _LENGTH_PX * axis, along / _LENGTH_PX, sd, means, np.stack(outlines))
+    return ShaftEnd(frames, base + moved * along, axis, along, moved, sd, means, np.stack(outlines))
 
 
-def _aligned(recording: Recording, frames: np.ndarray, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each image, pictures (k, h, w, 3) around the base, in which the tool points right, and which frames they show."""
-    shown = np.isfinite(u).all(axis=(2, 3)) & inside(u, recording.image_size_px)[:, :, 0]
+def _aligned(
+    recording: Recording, frames: np.ndarray, base: np.ndarray, along: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each image, pictures (k, h, w, 3) around the base, in which the shaft points right, and which frames they show."""
+    shown = np.isfinite(base + along).all(axis=2) & inside(base, recording.image_size_px)
+    zoom, angle = _LENGTH_PX / np.linalg.norm(along, axis=-1), np.arctan2(along[..., 1], along[..., 0])
     found: tuple[list[np.ndarray], ...] = ([], [])
     for k in np.flatnonzero(shown.any(axis=1)):
-        frame, angle = recording.frames[int(frames[k])], tool_pose(u[k])[1]
-        zoom = _LENGTH_PX / np.linalg.norm(u[k, :, 1:].mean(axis=1) - u[k, :, 0], axis=1)
+        frame = recording.frames[int(frames[k])]
         for side in np.flatnonzero(shown[k]):
-            matrix = window_from_image(u[k, side, 0], angle[side], _SIZE_PX, zoom[side])
+            matrix = window_from_image(base[k, side], angle[k, side], _SIZE_PX, zoom[k, side])
             found[side].append(cut((frame.left, frame.right)[side], matrix, _SIZE_PX, border=cv2.BORDER_REPLICATE))
     return [
         (np.array(pictures, np.float32).reshape(-1, *_SIZE_PX[::-1], 3), np.flatnonzero(shown[:, side]))

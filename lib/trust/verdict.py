@@ -12,10 +12,10 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from lib import paths
 from lib.calibration import Calibration, CompetingCamerasError, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.calibration.checks import extents
-from lib.calibration.offsets import with_offsets
+from lib.calibration.offsets import shown_axes, with_offsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
-from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
+from lib.landmarks.shaft import ShaftEnd, shaft_axis, shaft_end
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
 from lib.trust.health import Health, feature_matches, health, spread
@@ -374,8 +374,9 @@ def _shaft(recording: Recording, data: Correspondences, calibration: Calibration
     if recording.skeleton != LANDMARKS or calibration.rig is None:
         return None
     x = with_offsets(data, calibration.offsets).of_frames(frames).grid("x_mm")
-    u = np.stack(calibration.pair.project(x.reshape(-1, 3)), axis=1).reshape(len(frames), 3, 2, 2).swapaxes(1, 2)
-    return shaft_end(recording, frames, u, tilt(x, calibration.cameras))
+    base = np.stack(calibration.pair.project(x[:, 0]), axis=1)
+    where = recording, frames, base, shown_axes(x, calibration.cameras)
+    return shaft_end(*where, shaft_axis(*where))
 
 
 def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:
