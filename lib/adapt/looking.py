@@ -54,6 +54,11 @@ class Seen(NamedTuple):
         covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
         return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
 
+    def with_base(self, other: Self) -> Self:
+        """A copy with the bases of other detections in the same frames."""
+        parts = zip(self[1:], other[1:], strict=True)
+        return Seen(self.frame, *(np.concatenate([base[:, :, :1], tips[:, :, 1:]], axis=2) for tips, base in parts))
+
 
 def look(
     recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,

@@ -14,7 +14,7 @@ import numpy as np
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.teacher import LABEL, RefusalError, Teacher, longest_still, teach
+from lib.adapt.teacher import LABEL, OtherBaseError, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -31,7 +31,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 27  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 28  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -192,6 +192,7 @@ class _Work:
         kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 5))]  # the rest count as unlabelled
         self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.learns = isinstance(self.detector, Detector)  # other callables have no networks
+        self.looks_near = self.learns and bool(self.detector.closeup_network)
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
         shown = (recording.frames[int(i)] for i in self.frames[::12])  # changed images in the same folder need new work
@@ -272,7 +273,7 @@ class _Work:
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
         try:
-            teacher = teach(recording, seen.labelled(few).of(learn), by_hand=by_hand)
+            teacher = self.taught(seen.labelled(few).of(learn), by_hand)
             if self.contradicted(teacher):
                 raise RefusalError("labels: detector and robot agree with each other, but not with the labels; check both.")
         except RefusalError:
@@ -281,7 +282,7 @@ class _Work:
             teacher = teach(recording, None, by_hand=by_hand)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
-        for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untrained, near the robot's landmarks
+        for k in range(_GUIDED if self.looks_near else 0):  # untrained, near the robot's landmarks
             guided = self.near(f"guided {k}", start, learn, teacher)
             try:
                 found = teach(recording, guided.labelled(few), opinion=guided, before=teacher, by_hand=by_hand)
@@ -331,6 +332,22 @@ class _Work:
                 break
         return self.judged(first, best, best_seen, teacher)
 
+    def taught(self, seen: Seen, by_hand: Seen | None) -> Teacher:
+        """The first teacher.  The detector may mark the kink of angled jaws instead of the base.
+
+        Then the tips alone give the cameras, and the base is detected near the robot's.
+        """
+        try:
+            return teach(self.recording, seen, by_hand=by_hand)
+        except OtherBaseError:
+            if not self.looks_near:
+                raise
+            tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
+            near = self.near("base", self.detector, seen.frame, tips)
+            if self.axis[0] > _ANGLED:
+                raise
+            return teach(self.recording, seen.with_base(near), by_hand=by_hand)
+
     def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:
         """Detections near the robot's landmarks; if the jaws are angled, those of the base in windows along the shaft."""
         u = teacher.labels(frames)[0]
@@ -342,9 +359,7 @@ class _Work:
         along = axes @ self.axis
         aside = 0.2 * along[..., ::-1] * [1, -1]
         straight = u[:, :, :1] + np.stack([0 * along, along + aside, along - aside], axis=2)
-        other = self.look(f"{name} along the shaft", detector, frames, straight)
-        parts = (np.concatenate([new[:, :, :1], old[:, :, 1:]], axis=2) for new, old in zip(other[1:], seen[1:], strict=True))
-        return Seen(seen.frame, *parts)
+        return seen.with_base(self.look(f"{name} along the shaft", detector, frames, straight))
 
     def contradicted(self, teacher: Teacher) -> bool:
         """True if a teacher's landmarks are too far from labels set by hand."""

@@ -80,6 +80,10 @@ class RefusalError(DataError):
     """The recording cannot teach; the message states why, and what to do."""
 
 
+class OtherBaseError(RefusalError):
+    """The detector marks another point than the robot for the base, but for no other landmark."""
+
+
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and a note; all frames and "" if they did not."""
     rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
@@ -161,26 +165,30 @@ class Teacher:
         return shown_axes(self.recording.landmarks_mm()[frames], self.calibration.cameras)
 
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
-        """The teacher whose base is moved along the tool by the measured end of the shaft; itself if the two disagree.
+        """The teacher whose base is moved along the shaft to its measured end; itself if the two disagree.
 
         If the detector knows the tool, its label is better than the end; if not, the label errs as it states.  Both are
         equally likely beforehand.  The size of the shift changes the odds, which weigh the corrections of the two cases.
+        A detector that does not know the tool marks the base behind the end, so an end behind the label leaves the first case.
         """
         if end is None:
             return self
         u, covariance = self.project(end.frame)
         along = end.along / (end.along**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
         shift = np.nanmedian(((end.u - u[:, :, 0]) * along).sum(axis=-1))
-        variance = [_KNOWN_BASE**2, np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))]
-        total = np.add(variance, end.sd**2)
-        if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total[1]):
+        unknown = np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))
+        variance = np.array([_KNOWN_BASE**2, unknown] if shift > 0 else [_KNOWN_BASE**2])
+        total = variance + end.sd**2
+        if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total[-1]):
             return self
         gain, odds = variance / total, np.exp(-(shift**2) / (2 * total)) / np.sqrt(total)
         mean, square = (np.average(value, weights=odds) for value in (gain, gain**2))
         length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
         offset[0] += mean * shift * length_mm * end.axis
         variance = (mean * end.sd**2 + (square - mean**2) * shift**2) * length_mm**2
-        own[0] -= max(0.0, end.axis @ own[0] @ end.axis - variance) * np.outer(end.axis, end.axis)
+        across = own[0] @ end.axis
+        before = across @ end.axis
+        own[0] -= max(0.0, before - variance) / before**2 * np.outer(across, across)  # as by a measurement
         return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -246,7 +254,7 @@ def teach(
         sd_mm = np.linalg.norm(offsets.standard_deviation * offsets.offset, axis=1) / np.maximum(size_mm, 1e-9)
         if (low := size_mm - 2 * sd_mm).max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
             k = int(low.argmax())
-            raise RefusalError(
+            raise (RefusalError if k else OtherBaseError)(
                 f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
                 f"{100 * size_mm[k] / length:.0f} % of the tool's length. It marks another point, or the robot's tool has "
                 f"other dimensions. {LABEL}"

@@ -41,8 +41,8 @@ _LARGE = 0.75
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
 AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
-#: Search of the shaft's direction: side of the pictures and the part of them behind the base (width, height), at half the scale
-#: of `_SIZE_PX`; largest angle from the direction of the tips; factor by which the best energy must exceed the median.
+#: Search of the shaft's direction: side of the pictures and the part of them behind the base (width, height), at half the
+#: scale of `_SIZE_PX`; largest angle from the direction of the tips; factor by which the best energy exceeds the median.
 _AROUND_PX, _BEHIND_PX, _WIDEST_DEG, _SHARP = 121, (38, 71), 64, 3.0
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: five recordings by other renderers and on validation recordings.

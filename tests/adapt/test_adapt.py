@@ -19,7 +19,7 @@ from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.correspondences import DataError
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
-from lib.landmarks.shaft import ShaftEnd
+from lib.landmarks.shaft import AHEAD, ShaftEnd
 from lib.recordings import Kinematics
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
@@ -233,6 +233,49 @@ class LaterStages(StandIn):
 
     def refine(self, images, rough, stage, *, reach):
         return self(images)
+
+
+@pytest.mark.parametrize("angled", [True, False])
+def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_the_robot_reports_it(
+    world, recording, tmp_path, monkeypatch, angled
+):
+    kinks = world.u.copy()
+    kinks[:, :, 0] += 0.2 * (world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0])
+    asked = []
+
+    def refusing(recording, seen, **how):
+        off = np.linalg.norm(seen.u - kinks[seen.frame], axis=-1)[:, :, 0]
+        if np.median(off) < 2 and seen.confidence[:, :, 0].any():
+            raise teacher.OtherBaseError("detector: it sees base elsewhere.")
+        return teach(recording, seen, **how)
+
+    class Kinked(StandIn):
+        networks, closeup_network, digest = {}, "some", ""
+
+        def near(self, images, u, *, reach):
+            asked.append(u)
+            return StandIn(world.u, noise_px=0.7)(images)
+
+    class ReachedError(Exception):
+        """Training starts."""
+
+    def tune(detector, images, *rest, **how):
+        off = [one.u - world.u[int(one.name.split()[1]), int(one.name.startswith("right"))] for one in images]
+        assert np.nanmedian(np.linalg.norm(off, axis=-1)) < 1.5
+        raise ReachedError
+
+    monkeypatch.setattr(loop, "Detector", Kinked)
+    monkeypatch.setattr(loop, "teach", refusing)
+    monkeypatch.setattr(loop, "shaft_axis", lambda *_: np.array([0.8, 0.6, 0.0]) if angled else AHEAD)
+    work = {"folder": tmp_path, "progress": False, "tune": tune}
+    if angled:
+        with pytest.raises(ReachedError):
+            adapt(recording, Kinked(kinks, noise_px=0.7), **work)
+        shaft = asked[len(world.u)][:, 1:].mean(axis=1) - asked[len(world.u)][:, 0]  # after one look at each frame
+        tips = asked[0][:, 1:].mean(axis=1) - asked[0][:, 0]
+        assert np.degrees(np.abs(np.arctan2(*shaft.T) - np.arctan2(*tips.T))).max() > 10
+    else:
+        assert "it sees base" in adapt(recording, Kinked(kinks, noise_px=0.7), **work).report["reason"]
 
 
 def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
@@ -689,7 +732,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(StandIn, "save", lambda self, path: path.write_bytes(b"weights"), raising=False)
     monkeypatch.setattr(report, "adapt", lambda *a, **k: adapt(*a, **k, progress=False, tune=tune))
     pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
-    far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), 5.0, 0.01, pictures, outline)
+    far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), AHEAD, np.ones((3, 2, 2)), 5.0, 0.01, pictures, outline)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: far_off)
     out = tmp_path / "better"
     assert report.main([str(recording.folder), "--out", str(out), "--minutes", "1"]) == 0
@@ -722,7 +765,8 @@ def test_the_end_of_the_shaft_corrects_a_base_that_detector_and_robot_leave_open
 
     recording = world.record(tmp_path / "lab", robot=robot)
     pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
-    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], 0.01, 0.01, pictures, outline)
+    along = world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0]
+    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], AHEAD, along, 0.01, 0.01, pictures, outline)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: end if shown else None)
     found = adapt(recording, StandIn(world.u, noise_px=0.7), folder=tmp_path, progress=False, tune=pupil(world))
     exact = world.u[found.frames["judge"]]

@@ -9,7 +9,7 @@ import pytest
 
 from lib.adapt import teach
 from lib.adapt.looking import look
-from lib.landmarks.shaft import ShaftEnd, shaft_end, tilt
+from lib.landmarks.shaft import AHEAD, ShaftEnd, shaft_axis, shaft_end
 from lib.recordings import StereoFrame
 from tests.adapt.world import StandIn, World
 
@@ -25,16 +25,23 @@ def tools(sine):
     return base[:, :, None] + length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def pictured(u, sine, *, radius_px=12.0, taper=0.0, shaft=True, jaws=True):
+def shown(u, sine):
+    """The images (m, 2, 2, 3) px of the tool's axes; the second one lies in the image plane."""
+    along = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
+    size = np.linalg.norm(along, axis=-1, keepdims=True)
+    across = along[..., ::-1] * [-1, 1] / np.sqrt(1 - sine**2)
+    return np.stack([along, across, LENGTH_PX * sine * along / size], axis=-1)
+
+
+def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, shaft=True, jaws=True):
     """A recording of drawn tools, whose shafts end at the base, on a ground that differs in every frame."""
     rng, pairs = np.random.default_rng(1), []
-    for pair in u:
+    for pair, axes in zip(u, shown(u, sine), strict=True):
         images = []
-        for base, *tips in pair:
+        for (base, *tips), shaft_px in zip(pair, axes @ axis, strict=True):
             ground = cv2.GaussianBlur(rng.normal(0, 1, SIZE[::-1]), (0, 0), 4)
             large = np.repeat(np.repeat(150 + 20 * ground / ground.std(), 4, axis=0), 4, axis=1).astype(np.float32)
-            axis = np.mean(tips, axis=0) - base
-            along = axis / np.linalg.norm(axis)
+            along = shaft_px / np.linalg.norm(shaft_px)
             across = np.array([-along[1], along[0]])
             turn = np.linspace(-np.pi / 2, np.pi / 2, 40)[:, None]
             end = radius_px * (sine * np.cos(turn) * along + np.sin(turn) * across)
@@ -58,7 +65,7 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
     labels = u.copy()
     labels[:, :, 0] += share * axis
-    found = shaft_end(pictured(u, sine, taper=taper), FRAMES, labels, np.full((len(FRAMES), 2), sine))
+    found = shaft_end(pictured(u, sine, taper=taper), FRAMES, labels[:, :, 0], shown(u, sine))
     length = np.linalg.norm(axis, axis=-1)
     assert (np.linalg.norm(found.u - u[:, :, 0], axis=-1) / length).max() < 0.012
     assert found.pictures.shape == (2, 141, 161, 3) and found.outline.shape[::2] == (2, 2)
@@ -66,14 +73,39 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     assert np.abs(middle - 70).max() < 4  # the outline lies around the tool's axis, which is the row of the label
 
 
+def test_a_shaft_that_does_not_point_to_the_tips_is_found_with_its_end():
+    """Jaws at an angle of 35 degrees: along the tips no shaft ends."""
+    sine, axis = 0.3, np.array([np.cos(np.radians(35)), np.sin(np.radians(35)), 0.0])
+    u = tools(sine)
+    recording, axes = pictured(u, sine, axis=axis), shown(u, sine)
+    base = u[:, :, 0] - 0.06 * axes @ axis
+    found = shaft_axis(recording, FRAMES, base, axes)
+    apart = [np.arctan2(*np.moveaxis(axes @ one, -1, 0)) for one in (found, axis)]  # the images fix two of three angles
+    assert np.degrees(np.abs(apart[0] - apart[1])).max() < 2.5
+    end, straight = shaft_end(recording, FRAMES, base, axes, found), shaft_end(recording, FRAMES, base, axes)
+    off = np.linalg.norm(end.u - u[:, :, 0], axis=-1) / np.linalg.norm(axes[..., 0], axis=-1)
+    assert off.max() < 0.02 and np.allclose(end.u, base + end.moved * end.along)
+    assert straight is None or np.linalg.norm(straight.u - u[:, :, 0], axis=-1).max() > np.linalg.norm(end.u - u[:, :, 0], axis=-1).max()
+
+
+@pytest.mark.parametrize("shaft", [True, False])
+def test_a_shaft_that_points_to_the_tips_or_is_not_shown_gives_their_direction(shaft):
+    u = tools(0.3)
+    found = shaft_axis(pictured(u, 0.3, shaft=shaft, jaws=shaft), FRAMES, u[:, :, 0], shown(u, 0.3))
+    across = np.einsum("mcik,k->mci", shown(u, 0.3), found)
+    off = np.arctan2(*np.moveaxis(across, -1, 0)) - np.arctan2(*np.moveaxis(shown(u, 0.3)[..., 0], -1, 0))
+    assert np.degrees(np.abs(off)).max() < 2.5 if shaft else np.array_equal(found, AHEAD)
+
+
 def test_frames_in_which_the_robot_is_silent_are_left_out():
     u = tools(0.5)
-    labels, recording, sine = u.copy(), pictured(u, 0.5), np.full((len(FRAMES), 2), 0.5)
-    labels[:, :, 0] += 0.1 * (u[:, :, 1:].mean(axis=2) - u[:, :, 0])
-    alone, again = shaft_end(recording, FRAMES, labels, sine), np.append(FRAMES, [3, 8])
-    silent = np.concatenate([sine, np.full((2, 2), np.nan)])  # without a report the tilt is unknown
-    found = shaft_end(recording, again, labels[again], silent)
+    recording, axes = pictured(u, 0.5), shown(u, 0.5)
+    base = u[:, :, 0] + 0.1 * axes[..., 0]
+    alone, again = shaft_end(recording, FRAMES, base, axes), np.append(FRAMES, [3, 8])
+    silent = np.concatenate([axes, np.full((2, 2, 2, 3), np.nan)])  # without a report the axes are unknown
+    found = shaft_end(recording, again, base[again], silent)
     assert found.moved == alone.moved and np.array_equal(found.u[: len(FRAMES)], alone.u)
+    assert np.array_equal(shaft_axis(recording, again, base[again], silent), shaft_axis(recording, FRAMES, base, axes))
 
 
 @pytest.mark.parametrize("left_out", ["tool", "shaft", "edges", "frames"])
@@ -83,7 +115,7 @@ def test_pictures_that_show_no_end_of_a_shaft_give_none(left_out):
     if left_out == "edges":
         blank = np.full((*SIZE[::-1], 3), 90, np.uint8)
         recording.frames = [StereoFrame(blank, blank, 0.0) for _ in FRAMES]
-    assert shaft_end(recording, frames, u[frames], np.full((len(frames), 2), 0.4)) is None
+    assert shaft_end(recording, frames, u[frames, :, 0], shown(u[frames], 0.4)) is None
 
 
 def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edge(tmp_path):
@@ -96,7 +128,7 @@ def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edg
     axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
 
     def moved(share, sd):
-        end = ShaftEnd(frames, u[:, :, 0] + share * axis, share, sd, np.empty(0), np.empty(0))
+        end = ShaftEnd(frames, u[:, :, 0] + share * axis, AHEAD, axis, share, sd, np.empty(0), np.empty(0))
         found = teacher.with_base(end)
         off = found.labels(frames)[0] - u
         assert np.nanmax(np.abs(off[:, :, 1:])) < 1e-9  # the tips stay
@@ -110,19 +142,24 @@ def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edg
     assert 0 < hardly < 0.5 * 0.01 and confirmed.offset_covariance_mm2[0, 0, 0] < teacher.offset_covariance_mm2[0, 0, 0]
     shares = [moved(size, 0.01)[0] / size for size in (0.005, 0.01, 0.02, 0.03)]
     assert (np.diff(shares) > 0).all() and np.diff(shares).max() < 0.35  # without a step
+    assert -0.3 * 0.02 < moved(-0.02, 0.01)[0] < 0  # a step lies behind the end, and so does the label
+    assert moved(-0.05, 0.01)[1] is teacher and moved(0.05, 0.01)[1] is not teacher
     assert moved(0.5, 0.002)[1] is teacher and teacher.with_base(None) is teacher
 
 
-def test_the_angle_between_tool_and_image_is_that_of_the_projection(tmp_path):
+def test_a_correction_along_an_angled_shaft_moves_the_base_there_and_makes_it_surer(tmp_path):
     world = World()
     frames = np.arange(world.n)
     recording = world.record(tmp_path / "lab")
     teacher = teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames))
-    x = recording.landmarks_mm()
-    size_mm = np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)
-    size_px = np.linalg.norm(world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0], axis=-1)
-    cosine = size_px / size_mm[:, None] / 25.0  # the rig has 25 pixels a millimetre
-    known = np.isfinite(size_mm)
-    sine = tilt(x, teacher.calibration.cameras)[known]
-    assert np.abs(np.sqrt(1 - sine**2) - cosine[known]).max() < 0.05
-    assert (sine > 0).mean() > 0.9  # the shaft enters from the side of the microscope
+    own = np.diag([0.2, 0.1, 0.05]) ** 2
+    teacher = replace(teacher, offset_covariance_mm2=np.tile(own, (3, 1, 1)))
+    axis = np.array([0.8, 0.0, 0.6])
+    along = teacher.axes_px(frames) @ axis
+    end = ShaftEnd(frames, teacher.labels(frames)[0][:, :, 0] + 0.03 * along, axis, along, 0.03, 0.002, None, None)
+    found = teacher.with_base(end)
+    shift_mm = found.offset_mm[0] - teacher.offset_mm[0]
+    assert np.allclose(shift_mm, np.linalg.norm(shift_mm) * axis) and np.linalg.norm(shift_mm) > 0
+    surer = found.offset_covariance_mm2[0]
+    assert np.linalg.eigvalsh(surer).min() > 0 and axis @ surer @ axis < 0.1 * axis @ own @ axis
+    assert np.linalg.eigvalsh(own - surer).min() > -1e-12 and np.isclose(surer[1, 1], own[1, 1])

@@ -135,7 +135,7 @@ def test_witnesses_count():
     bad = Health(np.arange(20), {"looks": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
     assert names(data, health=bad) == {"detector_unfit": LEVELS[2]}
     assert names(data, doubts=[Doubt("log_gap", "An hour.", "Look.")]) == {"log_gap": LEVELS[1]}
-    end = [ShaftEnd(np.arange(3), np.zeros((3, 2, 2)), moved, 0.01, None, None) for moved in (-0.05, 0.025, 0.05)]
+    end = [ShaftEnd(np.arange(3), *[np.zeros((3, 2, 2))] * 3, moved, 0.01, None, None) for moved in (-0.05, 0.025, 0.05)]
     assert [names(data, shaft=one) for one in end] == [{"base": LEVELS[1]}, {}, {"base": LEVELS[1]}]
 
 
