@@ -169,7 +169,7 @@ class Teacher:
 
         If the detector knows the tool, its label is better than the end; if not, the label errs as it states.  Both are
         equally likely beforehand.  The size of the shift changes the odds, which weigh the corrections of the two cases.
-        A detector that does not know the tool marks the base behind the end, so an end behind the label leaves the first case.
+        A detector that does not know the tool marks the base too far back: an end behind the label leaves the first case.
         """
         if end is None:
             return self

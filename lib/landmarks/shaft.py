@@ -78,18 +78,11 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
     Arguments as of `shaft_end`.  Behind the base the mean of the frames, each turned so that the shaft points right, is
     averaged along the rows.  If all frames are turned rightly, the sides of the shaft are steep steps of this profile.
     """
-    views = []
-    for side, length in enumerate(np.nanmedian(_facing(axes), axis=0)):
-        shown = np.isfinite(base[:, side]).all(axis=1) & np.isfinite(axes[:, side]).all(axis=(1, 2))
-        shown = np.flatnonzero(shown & inside(base[:, side], recording.image_size_px))
-        matrices = window_from_image(base[shown, side], np.zeros(len(shown)), _AROUND_PX, 0.5 * _LENGTH_PX / length)
-        images = ((recording.frames[int(k)].left, recording.frames[int(k)].right)[side] for k in frames[shown])
-        pairs = zip(images, matrices, strict=True)
-        pictures = np.array([cut(*pair, _AROUND_PX, border=cv2.BORDER_REPLICATE) for pair in pairs], np.float32)
-        if len(shown) < _GROUPS * _FEWEST:
-            return AHEAD
-        pictures -= pictures.mean(axis=(1, 2), keepdims=True)
-        views.append((pictures / np.maximum(pictures.std(axis=(1, 2, 3), keepdims=True), 1.0), axes[shown, side]))
+    facing = np.where(np.isfinite(axes).all(axis=(2, 3)), np.nanmedian(_facing(axes), axis=0), np.nan)
+    upright = _aligned(recording, frames, base, 2 * facing[..., None] * [1, 0], (_AROUND_PX, _AROUND_PX))
+    views = [(_even(pictures), axes[kept, side]) for side, (pictures, kept) in enumerate(upright)]
+    if min(len(shown) for _, shown in views) < _GROUPS * _FEWEST:
+        return AHEAD
 
     def steps(direction: np.ndarray) -> float:
         """Energy of the steps of the mean profile across the shaft, if this is its direction."""
@@ -126,11 +119,8 @@ def _around(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def _facing(axes: np.ndarray) -> np.ndarray:
-    """Length (m, k) px of a tool that lies in the image plane."""
-    size = np.full(axes.shape[:2], np.nan)
-    known = np.isfinite(axes).all(axis=(2, 3))
-    size[known] = np.linalg.svd(axes[known], compute_uv=False)[:, 0]
-    return size
+    """Length (m, 2) px of a tool in the image plane; the images of its three axes have together sqrt(2) times this norm."""
+    return np.linalg.norm(axes, axis=(2, 3)) / np.sqrt(2)
 
 
 def shaft_end(
@@ -153,8 +143,7 @@ def shaft_end(
     scores, sines = [], []
     for side, (pictures, kept) in enumerate(aligned):
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
-        even = pictures - pictures.mean(axis=(1, 2), keepdims=True)
-        even /= np.maximum(even.std(axis=(1, 2, 3), keepdims=True), 1.0)
+        even = _even(pictures)
         sines.append(np.array([sine[kept[group], side].mean() for group in groups]))
         scores.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
     clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
@@ -181,20 +170,26 @@ def shaft_end(
     return ShaftEnd(frames, base + moved * along, axis, along, moved, sd, means, np.stack(outlines))
 
 
+def _even(pictures: np.ndarray) -> np.ndarray:
+    """Pictures (k, h, w, 3) of equal mean colour and contrast."""
+    even = pictures - pictures.mean(axis=(1, 2), keepdims=True)
+    return even / np.maximum(even.std(axis=(1, 2, 3), keepdims=True), 1.0)
+
+
 def _aligned(
-    recording: Recording, frames: np.ndarray, base: np.ndarray, along: np.ndarray
+    recording: Recording, frames: np.ndarray, base: np.ndarray, along: np.ndarray, size_px: tuple[int, int] = _SIZE_PX
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each image, pictures (k, h, w, 3) around the base, in which the shaft points right, and which frames they show."""
+    """Of each image, pictures (k, h, w, 3) around the base, in which `along` points right, and which frames they show."""
     shown = np.isfinite(base + along).all(axis=2) & inside(base, recording.image_size_px)
     zoom, angle = _LENGTH_PX / np.linalg.norm(along, axis=-1), np.arctan2(along[..., 1], along[..., 0])
     found: tuple[list[np.ndarray], ...] = ([], [])
     for k in np.flatnonzero(shown.any(axis=1)):
         frame = recording.frames[int(frames[k])]
         for side in np.flatnonzero(shown[k]):
-            matrix = window_from_image(base[k, side], angle[k, side], _SIZE_PX, zoom[k, side])
-            found[side].append(cut((frame.left, frame.right)[side], matrix, _SIZE_PX, border=cv2.BORDER_REPLICATE))
+            matrix = window_from_image(base[k, side], angle[k, side], size_px, zoom[k, side])
+            found[side].append(cut((frame.left, frame.right)[side], matrix, size_px, border=cv2.BORDER_REPLICATE))
     return [
-        (np.array(pictures, np.float32).reshape(-1, *_SIZE_PX[::-1], 3), np.flatnonzero(shown[:, side]))
+        (np.array(pictures, np.float32).reshape(-1, *size_px[::-1], 3), np.flatnonzero(shown[:, side]))
         for side, pictures in enumerate(found)
     ]
 

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import CompetingCamerasError, calibrate, estimate, with_offsets
-from lib.calibration.offsets import Unsettled, carried, estimate_offsets, start_of_turning, tool_axes
+from lib.calibration.offsets import Unsettled, carried, estimate_offsets, shown_axes, start_of_turning, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
-from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
+from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.calibration.rigs import LANDMARKS_MM, OFFSETS_MM, tool_sweep
 
 
@@ -26,6 +26,22 @@ def test_axes_are_those_of_the_tool():
     assert np.isnan(tool_axes(shut[None])).any()
     with pytest.raises(ValueError, match="base, tip_1 and tip_2"):
         tool_axes(np.zeros((4, 2, 3)))
+
+
+def test_shown_axes_are_projected_and_those_of_jaws_that_are_always_shut_are_the_first():
+    rig, turn = reference_rig(), Rotation.random(6, random_state=0).as_matrix()
+    x = LANDMARKS_MM @ turn.mT
+    x[4] = np.nan  # the robot is silent
+    found = shown_axes(x, (rig.left, rig.right))
+    length_mm = np.linalg.norm(LANDMARKS_MM[1:].mean(axis=0) - LANDMARKS_MM[0])
+    assert found.shape == (6, 2, 2, 3) and np.isnan(found[4]).all() and np.isfinite(found[:4]).all()
+    step = np.stack(rig.project(x[:, 0] + length_mm * tool_axes(x)[:, :, 2])) - np.stack(rig.project(x[:, 0]))
+    np.testing.assert_allclose(found[..., 2], step.swapaxes(0, 1), atol=1e-8)
+    shut = x.copy()
+    shut[:, 1:] = x[:, 1:].mean(axis=1, keepdims=True)
+    closed = shown_axes(shut, (rig.left, rig.right))
+    np.testing.assert_allclose(closed[..., 0], found[..., 0], atol=1e-8)
+    assert np.nanmax(np.abs(closed[..., 1:])) == 0
 
 
 @pytest.mark.parametrize("width_mm", [0.25, 0.4, 1.0])
