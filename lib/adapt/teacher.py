@@ -187,9 +187,9 @@ class Teacher:
         length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
         offset[0] += mean * shift * length_mm * end.axis
         variance = (mean * end.sd**2 + (square - mean**2) * shift**2) * length_mm**2
-        across = own[0] @ end.axis
-        before = across @ end.axis
-        own[0] -= max(0.0, before - variance) / before**2 * np.outer(across, across)  # as by a measurement
+        own_along = own[0] @ end.axis
+        if (before := own_along @ end.axis) > variance:  # then it falls, as by a measurement
+            own[0] -= (before - variance) / before**2 * np.outer(own_along, own_along)
         return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -163,3 +163,5 @@ def test_a_correction_along_an_angled_shaft_moves_the_base_there_and_makes_it_su
     surer = found.offset_covariance_mm2[0]
     assert np.linalg.eigvalsh(surer).min() > 0 and axis @ surer @ axis < 0.1 * axis @ own @ axis
     assert np.linalg.eigvalsh(own - surer).min() > -1e-12 and np.isclose(surer[1, 1], own[1, 1])
+    exact = replace(teacher, offset_covariance_mm2=np.zeros((3, 3, 3))).with_base(end)
+    assert not exact.offset_covariance_mm2.any()
