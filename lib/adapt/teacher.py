@@ -45,9 +45,6 @@ _EXPLAINED = 0.15
 _HARMLESS = 0.01
 #: Largest share of the frames in which the images may contradict the robot.
 _CONTRADICTED = 0.2
-#: The base has no edge that ends along the shaft.  A detector's constant error there is this multiple of its stated standard
-#: deviation, if that exceeds `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools, also by two other renderers.
-_BASE_BIAS = 2.0
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
 #: standard deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm even for short tools.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
@@ -263,7 +260,7 @@ def teach(
         if fault is not None and not (alone or clicked):
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {LABEL}")
         turns = offsets.turns
-        own = 0.2 * OWN_BIAS if alone else _own_bias(seen if opinion is None else opinion)
+        own = 0.2 * OWN_BIAS if alone else (opinion or seen).own_bias
         offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
@@ -296,15 +293,6 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
     with suppress(*_POOR):
         return _placed(recording, opinion.of(frames)).offsets
     return None
-
-
-def _own_bias(seen: Seen) -> np.ndarray:
-    """Standard deviations (3, 3) of a detector's constant errors: `OWN_BIAS`, and more if it is unsure of the base."""
-    along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
-    stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
-    own = OWN_BIAS.copy()
-    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
-    return own
 
 
 def _length_mm(recording: Recording) -> float:

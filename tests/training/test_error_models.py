@@ -127,8 +127,9 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     assert ((gain >= 0) & (gain <= 1)).all()
     assert once.error_models["tracking"].gain == ((1.0, 1.0),) * 3
     assert fit_error_models(once, frames).error_models == once.error_models  # what was believed before does not matter
-    errors = [np.nanmedian(evaluate(d, frames).error_px) for d in (once, replace(once, closeup_network=None))]
-    assert errors[0] < errors[1] + 0.5
+    # Of each landmark: this toy errs far more at the base, so a median of all would jump between the two kinds.
+    errors = [np.nanmedian(evaluate(d, frames).error_px, axis=0) for d in (once, replace(once, closeup_network=None))]
+    assert (errors[0] < errors[1] + 0.5).all()
 
 
 def test_as_much_of_a_correction_is_believed_as_helps():
