@@ -346,6 +346,10 @@ class _Work:
             near = self.near("base", self.detector, seen.frame, tips)
             if self.axis[0] > _ANGLED:
                 raise
+            self.report["notes"].append(
+                f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the detector "
+                "marks another point than the base, perhaps the kink of the jaws: the base was searched near the robot's."
+            )
             return teach(self.recording, seen.with_base(near), by_hand=by_hand)
 
     def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:

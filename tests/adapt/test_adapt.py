@@ -256,26 +256,21 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
             asked.append(u)
             return StandIn(world.u, noise_px=0.7)(images)
 
-    class ReachedError(Exception):
-        """Training starts."""
-
     def tune(detector, images, *rest, **how):
         off = [one.u - world.u[int(one.name.split()[1]), int(one.name.startswith("right"))] for one in images]
         assert np.nanmedian(np.linalg.norm(off, axis=-1)) < 1.5
-        raise ReachedError
+        raise RefusalError("training starts")
 
     monkeypatch.setattr(loop, "Detector", Kinked)
     monkeypatch.setattr(loop, "teach", refusing)
     monkeypatch.setattr(loop, "shaft_axis", lambda *_: np.array([0.8, 0.6, 0.0]) if angled else AHEAD)
     work = {"folder": tmp_path, "progress": False, "tune": tune}
-    if angled:
-        with pytest.raises(ReachedError):
-            adapt(recording, Kinked(kinks, noise_px=0.7), **work)
-        shaft = asked[len(world.u)][:, 1:].mean(axis=1) - asked[len(world.u)][:, 0]  # after one look at each frame
-        tips = asked[0][:, 1:].mean(axis=1) - asked[0][:, 0]
+    report = adapt(recording, Kinked(kinks, noise_px=0.7), **work).report
+    assert ("training starts" if angled else "it sees base") in report["reason"]
+    assert any("37 degrees away from the tips" in note for note in report["notes"]) == angled
+    if angled:  # the first look at each frame is along the tips, the second one along the shaft
+        tips, shaft = (one[:, 1:].mean(axis=1) - one[:, 0] for one in (asked[0], asked[report["frames"]["learn"]]))
         assert np.degrees(np.abs(np.arctan2(*shaft.T) - np.arctan2(*tips.T))).max() > 10
-    else:
-        assert "it sees base" in adapt(recording, Kinked(kinks, noise_px=0.7), **work).report["reason"]
 
 
 def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
