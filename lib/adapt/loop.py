@@ -4,6 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -340,17 +341,19 @@ class _Work:
         try:
             return teach(self.recording, seen, by_hand=by_hand)
         except OtherBaseError:
-            if not self.looks_near:
-                raise
-            tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
-            near = self.near("base", self.detector, seen.frame, tips)
-            if self.axis[0] > _ANGLED:
-                raise
-            self.report["notes"].append(
-                f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the detector "
-                "marks another point than the base, perhaps the kink of the jaws: the base was searched near the robot's."
-            )
-            return teach(self.recording, seen.with_base(near), by_hand=by_hand)
+            if self.looks_near:
+                with suppress(RefusalError):
+                    tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
+                    near = self.near("base", self.detector, seen.frame, tips)
+                    if self.axis[0] < _ANGLED:
+                        teacher = teach(self.recording, seen.with_base(near), by_hand=by_hand)
+                        self.report["notes"].append(
+                            f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the "
+                            "detector marks another point than the base, perhaps the kink of the jaws. So the base was "
+                            "searched near the robot's."
+                        )
+                        return teacher
+            raise
 
     def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:
         """Detections near the robot's landmarks; if the jaws are angled, those of the base in windows along the shaft."""

@@ -235,9 +235,9 @@ class LaterStages(StandIn):
         return self(images)
 
 
-@pytest.mark.parametrize("angled", [True, False])
+@pytest.mark.parametrize(("angled", "found"), [(True, True), (False, True), (True, False)])
 def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_the_robot_reports_it(
-    world, recording, tmp_path, monkeypatch, angled
+    world, recording, tmp_path, monkeypatch, angled, found
 ):
     kinks = world.u.copy()
     kinks[:, :, 0] += 0.2 * (world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0])
@@ -254,7 +254,7 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
 
         def near(self, images, u, *, reach):
             asked.append(u)
-            return StandIn(world.u, noise_px=0.7)(images)
+            return StandIn(world.u if found else kinks, noise_px=0.7)(images)
 
     def tune(detector, images, *rest, **how):
         off = [one.u - world.u[int(one.name.split()[1]), int(one.name.startswith("right"))] for one in images]
@@ -266,8 +266,8 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
     monkeypatch.setattr(loop, "shaft_axis", lambda *_: np.array([0.8, 0.6, 0.0]) if angled else AHEAD)
     work = {"folder": tmp_path, "progress": False, "tune": tune}
     report = adapt(recording, Kinked(kinks, noise_px=0.7), **work).report
-    assert ("training starts" if angled else "it sees base") in report["reason"]
-    assert any("37 degrees away from the tips" in note for note in report["notes"]) == angled
+    assert ("training starts" if angled and found else "it sees base") in report["reason"]
+    assert any("37 degrees away from the tips" in note for note in report["notes"]) == (angled and found)
     if angled:  # the first look at each frame is along the tips, the second one along the shaft
         tips, shaft = (one[:, 1:].mean(axis=1) - one[:, 0] for one in (asked[0], asked[report["frames"]["learn"]]))
         assert np.degrees(np.abs(np.arctan2(*shaft.T) - np.arctan2(*tips.T))).max() > 10
