@@ -299,8 +299,7 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         if by_hand is None:  # else the labels tell where the base is
-            where = recording, learn, u[:, :, 0], teacher.axes_px(learn)
-            self.shaft = shaft_end(*where, shaft_axis(*where))
+            self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
             moved, teacher = teacher, teacher.with_base(self.shaft)
             shift_mm = teacher.offset_mm[0] - moved.offset_mm[0]
             self.report["base_moved_mm"] = 0.0 if self.shaft is None else float(shift_mm @ self.shaft.axis)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lib.landmarks.windows import cut, window_from_image
 from lib.recordings import Recording
@@ -84,38 +85,36 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
     if min(len(shown) for _, shown in views) < _GROUPS * _FEWEST:
         return AHEAD
 
-    def steps(direction: np.ndarray) -> float:
-        """Energy of the steps of the mean profile across the shaft, if this is its direction."""
-        energy, (wide, high) = 0.0, _BEHIND_PX
-        for pictures, shown in views:
-            x, y = np.moveaxis(shown @ direction / np.linalg.norm(shown @ direction, axis=1, keepdims=True), 1, 0)
-            turns = np.moveaxis(np.array([[x, -y], [y, x]]), 2, 0)
-            corners = turns @ [-8.0 - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            turned = (cv2.warpAffine(picture, np.column_stack(to), (wide, high), flags=flags)
-                      for picture, *to in zip(pictures, turns, corners, strict=True))
-            profile = cv2.GaussianBlur((sum(turned) / len(pictures)).mean(axis=1), (1, 3), 0.8)
-            energy += float((np.diff(profile, axis=0) ** 2).sum())
+    def steps(turns: np.ndarray) -> np.ndarray:
+        """Energy of the steps of the mean profile across the shaft, if these rotation vectors turn `AHEAD` along it."""
+        energy, (wide, high) = np.zeros(len(turns)), _BEHIND_PX
+        for i, direction in enumerate(Rotation.from_rotvec(turns).apply(AHEAD)):
+            for pictures, shown in views:
+                along = shown @ direction
+                x, y = (along / np.linalg.norm(along, axis=1, keepdims=True)).T
+                upright_from_turned = np.moveaxis(np.array([[x, -y], [y, x]]), 2, 0)
+                corners = upright_from_turned @ [-8.0 - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
+                matrices = np.concatenate([upright_from_turned, corners[:, :, None]], axis=2)
+                flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+                turned = (cv2.warpAffine(*one, (wide, high), flags=flags) for one in zip(pictures, matrices, strict=True))
+                profile = cv2.GaussianBlur((sum(turned) / len(pictures)).mean(axis=1), (1, 3), 0.8)
+                energy[i] += (np.diff(profile, axis=0) ** 2).sum()
         return energy
 
-    directions = _around(AHEAD, np.radians(np.arange(0, _WIDEST_DEG + 1, 8.0)))
-    energy = np.array([steps(direction) for direction in directions])
-    best, usual = directions[energy.argmax()], np.median(energy)
-    for angle in np.radians([4.0, 2.0, 1.0]):
-        directions = _around(best, np.array([0.0, angle]))
-        energy = np.array([steps(direction) for direction in directions])
-        best = directions[energy.argmax()]
-    return best if energy.max() > _SHARP * usual else AHEAD
+    def grid(half: float, step: float) -> np.ndarray:
+        """Rotation vectors (n, 3) about axes across `AHEAD`, up to `half` degrees in steps; the smallest first."""
+        angles = np.radians(np.arange(-half, half + 1, step))
+        turns = np.stack(np.meshgrid(0.0, angles, angles), axis=-1).reshape(-1, 3)
+        return turns[np.linalg.norm(turns, axis=1).argsort(kind="stable")]
 
-
-def _around(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) at these angles from a direction; on each circle they are about as far apart as the circles."""
-    beside = np.linalg.svd(direction[None])[2][1:]
-    found = [direction]
-    for angle in angles[1:]:
-        turn = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * np.sin(angle) / angles[1])), endpoint=False)
-        found += list(np.cos(angle) * direction + np.sin(angle) * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ beside)
-    return np.array(found)
+    turns = grid(_WIDEST_DEG, 8.0)
+    energy = steps(turns)
+    best, usual = turns[energy.argmax()], np.median(energy)
+    for step in (4.0, 2.0, 1.0):
+        turns = best + grid(step, step)
+        energy = steps(turns)
+        best = turns[energy.argmax()]
+    return Rotation.from_rotvec(best).apply(AHEAD) if energy.max() > _SHARP * usual else AHEAD
 
 
 def _facing(axes: np.ndarray) -> np.ndarray:
@@ -123,17 +122,15 @@ def _facing(axes: np.ndarray) -> np.ndarray:
     return np.linalg.norm(axes, axis=(2, 3)) / np.sqrt(2)
 
 
-def shaft_end(
-    recording: Recording, frames: np.ndarray, base: np.ndarray, axes: np.ndarray, axis: np.ndarray = AHEAD
-) -> ShaftEnd | None:
+def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: np.ndarray) -> ShaftEnd | None:
     """Measure where the shaft ends, or return None if the pictures do not show it clearly.
 
     Args:
         frames: Numbers (m,) of the frames.
         base: Where the base is expected (m, 2, 2) px in them; it may be off along the shaft.
         axes: The images (m, 2, 2, 3) px of the tool's axes, each as long as the tool; images where it is NaN are left out.
-        axis: Unit vector (3,) along the shaft towards the tips, in the tool's axes, by `shaft_axis`.
     """
+    axis = shaft_axis(recording, frames, base, axes)
     along = axes @ axis
     size = np.linalg.norm(along, axis=-1)
     sine = np.sqrt((1 - (size / _facing(axes)) ** 2).clip(0, _STEEPEST**2))

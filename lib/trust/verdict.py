@@ -15,7 +15,7 @@ from lib.calibration.checks import extents
 from lib.calibration.offsets import shown_axes, with_offsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
-from lib.landmarks.shaft import ShaftEnd, shaft_axis, shaft_end
+from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
 from lib.trust.health import Health, feature_matches, health, spread
@@ -375,8 +375,7 @@ def _shaft(recording: Recording, data: Correspondences, calibration: Calibration
         return None
     x = with_offsets(data, calibration.offsets).of_frames(frames).grid("x_mm")
     base = np.stack(calibration.pair.project(x[:, 0]), axis=1)
-    where = recording, frames, base, shown_axes(x, calibration.cameras)
-    return shaft_end(*where, shaft_axis(*where))
+    return shaft_end(recording, frames, base, shown_axes(x, calibration.cameras))
 
 
 def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:
