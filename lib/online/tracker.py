@@ -16,7 +16,7 @@ from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.result import FrameResult, Settings
 from lib.recordings import Scene
 from lib.registration import DriftMonitor, MovedCameras
-from lib.trust import Verdict, judge
+from lib.trust import judge
 
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score above which a single frame is rejected
@@ -138,14 +138,11 @@ class RigTracker:
             return
         self._tried = len(self._frames)
         found, kept = self._agreed(self._frames)
-        verdict = self._judged(found)
+        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
         if verdict.is_red or (self.cause and verdict.reasons):  # after a fault even a doubtful calibration is refused
             raise ValueError("; ".join(reason.text for reason in verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
-
-    def _judged(self, found: Calibration) -> Verdict:
-        return judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
 
     def _agreed(self, frames: Sequence[Seen]) -> tuple[Calibration, list[Seen]]:
         """A calibration with all frames, or with the newer or the older half, and the frames that agree with it."""
@@ -292,7 +289,8 @@ class RigTracker:
         with suppress(ValueError):
             found, kept = self._agreed([*self._frames, *self._since])
             newest = [with_offsets(frame.data, found.offsets) for frame in self._since[-first:]]
-            if not self._judged(found).reasons and self._fits(found.rig, newest):
+            verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+            if not verdict.reasons and self._fits(found.rig, newest):
                 self._frames, self._fitted = kept, len(kept)
                 return found
         return None
