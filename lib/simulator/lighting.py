@@ -110,12 +110,6 @@ class Lighting:
         place = (((axis + _HALF_MM) * scale - 0.5).astype(np.float32) for axis in (columns, rows))
         return 1 - self.shadow / 255 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
-    def behind(self, linear: np.ndarray, window: Window) -> None:
-        """Draw what lies behind the tool on the scene (h, w, 3), in place."""
-        for patch in self.patches:
-            if patch.role == "glare":
-                patch.lay(linear, window)
-
     def in_front(self, linear: np.ndarray, window: Window, u: np.ndarray, visibility: np.ndarray) -> np.ndarray:
         """Draw what lies in front of the tool on the image (h, w, 3), in place.  Returns the new visibility (3,)."""
         if self.tint_per_mm is not None:

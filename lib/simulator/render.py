@@ -110,7 +110,9 @@ def render_view(
         mirror *= light * np.float32(scene.gloss)
         glint_mask[mirror > 0.55] = 255
         linear += mirror[..., None]
-    lighting.behind(linear, window)
+    for patch in lighting.patches:
+        if patch.role == "glare":  # behind the tool
+            patch.lay(linear, window)
     sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(z))  # stated at 100 px per mm
     linear = blur_by_depth(linear, sigma, grid)
 
