@@ -200,15 +200,12 @@ class Instrument:
 
     def nodes(self, pose: Pose) -> Nodes:
         """As `Forceps.nodes`; the chains of each further object have the next three numbers."""
-        parts = [(3 * k + chain, *part) for k, one in enumerate([(self, pose), *self.others])
-                 for chain, part in enumerate(one[0].parts(one[1]))]  # fmt: skip
+        parts = []
+        for k, (tool, at) in enumerate([(self, pose), *self.others]):
+            behind, radius = np.array(tool.profile).T
+            x = np.unique(np.concatenate([np.linspace(behind[-1], _SHAFT_MM, 20), behind]))[::-1]
+            shaft = np.column_stack([-x, 0.5 * tool.bend_per_mm * x * x, np.zeros(len(x))]), np.interp(x, behind, radius)
+            jaws = [(jaw.opened(side, at.opening_mm)[:-1], jaw.radii) for jaw, side in zip(tool.jaws, (1, -1), strict=False)]
+            parts += [(3 * k + chain, at.place(line), r) for chain, (line, r) in enumerate([shaft, *jaws])]
         chains = np.concatenate([np.full(len(radii), chain) for chain, _, radii in parts])
         return np.vstack([line for _, line, _ in parts]), np.concatenate([radii for _, _, radii in parts]), chains
-
-    def parts(self, pose: Pose) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(centres in the microscope frame, radii) of the shaft and the jaws."""
-        behind, radius = np.array(self.profile).T
-        x = np.unique(np.concatenate([np.linspace(behind[-1], _SHAFT_MM, 20), behind]))[::-1]
-        shaft = np.column_stack([-x, 0.5 * self.bend_per_mm * x * x, np.zeros(len(x))]), np.interp(x, behind, radius)
-        jaws = [(jaw.opened(side, pose.opening_mm)[:-1], jaw.radii) for jaw, side in zip(self.jaws, (1, -1), strict=False)]
-        return [(pose.place(line), r) for line, r in [shaft, *jaws]]
