@@ -65,9 +65,20 @@ class Seen(NamedTuple):
         label_var = label_var * min(1.0, 0.9 * squared.mean() / max(label_var.mean(), 1e-12))  # if better than stated
 
         def fitted(row: int, loss: Callable[[np.ndarray], tuple], among: np.ndarray, start: np.ndarray) -> np.ndarray:
+            """Coefficients beta that minimise the mean of a loss of ``x @ beta``; `loss` returns values and derivatives.
+
+            A ridge penalty keeps them near `start` if that is a prior; else it keeps the slopes small.
+            """
             x = np.column_stack([~tip, tip, self.features[:, row, 1:]])[among].astype(float)
-            one_tip = np.array(start)[[0, 1, *range(3, FEATURES + 2)]]
-            return _coefficients(loss, x, one_tip, prior is not None, _RIDGE[row])[[0, 1, 1, *range(2, FEATURES + 1)]]
+            start = np.array(start)[[0, 1, *range(3, FEATURES + 2)]]  # with one tip for both
+            slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.where(prior is not None, start, 0.0)
+            ridge = np.full(len(start), _PRIOR / len(x)) if prior is not None else _RIDGE[row] * slopes
+
+            def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
+                value, slope = loss(x @ beta)
+                return value.mean() + ridge @ (beta - centre) ** 2, x.T @ slope / len(x) + 2 * ridge * (beta - centre)
+
+            return minimize(penalised, start, jac=True, method="L-BFGS-B").x[[0, 1, 1, *range(2, FEATURES + 1)]]
 
         def variance(axis: int) -> np.ndarray:
             def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -111,23 +122,6 @@ class Seen(NamedTuple):
                 i = np.abs(residual - centre[:, None]).mean(1).argmin()
                 best[k, axis], bias[k, axis] = gains[i], centre[i]
         return best, bias
-
-
-def _coefficients(
-    loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool, ridge_slopes: float
-) -> np.ndarray:
-    """Coefficients beta that minimise the mean of a loss of ``x @ beta``; `loss` returns its values and their derivatives.
-
-    A ridge penalty keeps them near `start` if that is a prior; else it keeps the slopes small, with weight `ridge_slopes`.
-    """
-    slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.where(is_prior, start, 0.0)
-    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else ridge_slopes * slopes
-
-    def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = loss(x @ beta)
-        return value.mean() + ridge @ (beta - centre) ** 2, x.T @ slope / len(x) + 2 * ridge * (beta - centre)
-
-    return minimize(penalised, start, jac=True, method="L-BFGS-B").x
 
 
 def seen_by(
