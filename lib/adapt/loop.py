@@ -4,7 +4,6 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -339,20 +338,22 @@ class _Work:
         """
         try:
             return teach(self.recording, seen, by_hand=by_hand)
-        except OtherBaseError:
-            if self.looks_near:
-                with suppress(RefusalError):
-                    tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
-                    near = self.near("base", self.detector, seen.frame, tips)
-                    if self.axis[0] < _ANGLED:
-                        teacher = teach(self.recording, seen.with_base(near), by_hand=by_hand)
-                        self.report["notes"].append(
-                            f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the "
-                            "detector marks another point than the base, perhaps the kink of the jaws. So the base was "
-                            "searched near the robot's."
-                        )
-                        return teacher
-            raise
+        except OtherBaseError as refused:
+            if not self.looks_near:
+                raise
+            try:
+                tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
+                near = self.near("base", self.detector, seen.frame, tips)
+                teacher = teach(self.recording, seen.with_base(near), by_hand=by_hand)
+            except RefusalError:
+                raise refused from None
+            if self.axis[0] > _ANGLED:
+                raise
+            self.report["notes"].append(
+                f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the detector "
+                "marks another point than the base, perhaps the kink of the jaws. So the base was searched near the robot's."
+            )
+            return teacher
 
     def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:
         """Detections near the robot's landmarks; if the jaws are angled, those of the base in windows along the shaft."""
@@ -363,7 +364,7 @@ class _Work:
         if self.axis[0] > _ANGLED:
             return seen
         along = axes @ self.axis
-        aside = 0.2 * along[..., ::-1] * [1, -1]
+        aside = 0.2 * along[..., ::-1] * [1, -1]  # the windows are those of straight jaws
         straight = u[:, :, :1] + np.stack([0 * along, along + aside, along - aside], axis=2)
         return seen.with_base(self.look(f"{name} along the shaft", detector, frames, straight))
 

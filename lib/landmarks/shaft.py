@@ -42,9 +42,11 @@ _LARGE = 0.75
 #: must exceed the median of all positions by this factor, and its mean score must be this large.
 _AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
 AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
-#: Search of the shaft's direction: side of the pictures and the part of them behind the base (width, height), at half the
-#: scale of `_SIZE_PX`; largest angle from the direction of the tips; factor by which the best energy exceeds the median.
-_AROUND_PX, _BEHIND_PX, _WIDEST_DEG, _SHARP = 121, (38, 71), 64, 3.0
+#: Search of the shaft's direction, at half the scale of `_SIZE_PX`: side of the pictures, and the part of them that is used:
+#: its distance behind the base, its width and height.
+_AROUND_PX, _GAP_PX, _BEHIND_PX = 121, 8.0, (38, 71)
+#: Largest angle from the direction of the tips, and factor by which the best energy exceeds the median of all directions.
+_WIDEST_DEG, _SHARP = 64, 3.0
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: five recordings by other renderers and on validation recordings.
 _SD, _SD_PX = 0.011, 1.0
@@ -90,10 +92,9 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
         energy, (wide, high) = np.zeros(len(turns)), _BEHIND_PX
         for i, direction in enumerate(Rotation.from_rotvec(turns).apply(AHEAD)):
             for pictures, shown in views:
-                along = shown @ direction
-                x, y = (along / np.linalg.norm(along, axis=1, keepdims=True)).T
+                x, y = (along := shown @ direction).T / np.linalg.norm(along, axis=1)
                 upright_from_turned = np.moveaxis(np.array([[x, -y], [y, x]]), 2, 0)
-                corners = upright_from_turned @ [-8.0 - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
+                corners = upright_from_turned @ [-_GAP_PX - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
                 matrices = np.concatenate([upright_from_turned, corners[:, :, None]], axis=2)
                 flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
                 turned = (cv2.warpAffine(*one, (wide, high), flags=flags) for one in zip(pictures, matrices, strict=True))
@@ -107,13 +108,11 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
         turns = np.stack(np.meshgrid(0.0, angles, angles), axis=-1).reshape(-1, 3)
         return turns[np.linalg.norm(turns, axis=1).argsort(kind="stable")]
 
-    turns = grid(_WIDEST_DEG, 8.0)
-    energy = steps(turns)
-    best, usual = turns[energy.argmax()], np.median(energy)
-    for step in (4.0, 2.0, 1.0):
-        turns = best + grid(step, step)
+    best, usual = np.zeros(3), 0.0
+    for half, step in ((_WIDEST_DEG, 8.0), (4.0, 4.0), (2.0, 2.0), (1.0, 1.0)):
+        turns = best + grid(half, step)
         energy = steps(turns)
-        best = turns[energy.argmax()]
+        best, usual = turns[energy.argmax()], usual or np.median(energy)  # that of all directions
     return Rotation.from_rotvec(best).apply(AHEAD) if energy.max() > _SHARP * usual else AHEAD
 
 
