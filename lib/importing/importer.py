@@ -177,7 +177,7 @@ def _tool(
         offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
     hinged = tool.hinge is not None and any(turning)
     if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
-        cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge, or tool.estimate = true"
+        cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge with robot.pose.gripper, or tool.estimate = true"
         raise ValueError(f"robot.pose: the position of {', '.join(lacks)} in the tool frame is not given; {cure}.")
     if hinged:
         return Tool.hinged(np.nan_to_num(offset), turning, tool.hinge.point_mm, tool.hinge.axis, tool.hinge.jaw_mm), sd

@@ -55,8 +55,9 @@ def main(argv: list[str] | None = None) -> int:
     elif a.what == "finetune":
         _finetune(a)
     elif a.what == "assemble":
-        assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note,
-                 Detector.load(a.initial) if a.initial else None)  # fmt: skip
+        if a.out is None:
+            raise ValueError("assemble: give a weights file to write with --out.")
+        assemble(a.folder, a.data, a.out, a.recordings, a.note, Detector.load(a.initial) if a.initial else None)
     elif a.what == "export":
         from lib.landmarks.export import export  # nothing else needs the package onnx
 

@@ -25,7 +25,10 @@ from tests.toys import toy_images
 def test_the_train_command_names_what_is_missing(tmp_path, capsys):
     assert COMMANDS["train"](["frame", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
     assert "no shard" in capsys.readouterr().err
-    assert COMMANDS["train"](["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assemble = ["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]
+    assert COMMANDS["train"](assemble) == 2  # it would replace the detector that ships
+    assert "--out" in capsys.readouterr().err
+    assert COMMANDS["train"]([*assemble, "--out", str(tmp_path / "weights.safetensors")]) == 2
     assert "last.safetensors" in capsys.readouterr().err
     assert COMMANDS["train"](["generate", "--data", str(tmp_path), "--photographs", str(tmp_path)]) == 2
     assert "holds no .png or .jpg" in capsys.readouterr().err
