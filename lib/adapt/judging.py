@@ -18,17 +18,19 @@ _CAP = 0.1
 _FEWEST, _NEAR_PX = 16, 1.5
 
 
-def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
+def stretches(frames: np.ndarray, time_s: np.ndarray, labelled: int = 0) -> dict[str, np.ndarray]:
     """Split frames into training, validation and test set ("learn", "stop", "judge"): stretches of time with gaps of 0.2 s.
+
+    `labelled` is the number of other frames, which are labelled by hand and belong to the training set.
 
     >>> parts = stretches(np.arange(40), np.arange(40) / 4)
     >>> [(int(part[0]), int(part[-1])) for part in parts.values()]
     [(0, 24), (26, 31), (33, 39)]
     """
     n = len(frames)
-    if n < 17:  # fewer would leave less than three for judging
-        raise RefusalError(f"recording: {n} frames are too few to learn from and to judge by; record 30 or more.")
-    first, second = round(0.64 * n), round(0.79 * n)
+    if n + labelled < 17 or n < 10:
+        raise RefusalError(f"recording: {n + labelled} frames are too few to learn from and to judge by; record 30 or more.")
+    first, second = min(round(0.64 * n), n - 7), min(round(0.79 * n), n - 4)  # three are left for judging
     parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
     for before, part in (("learn", "stop"), ("stop", "judge")):
         late = time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))
@@ -58,17 +60,27 @@ class Agreement:
         return found | {f"within_{100 * t:g}_percent": 100 * float((share <= t).mean()) for t in (0.01, 0.05, 0.1)}
 
 
+def sd_share(teacher: Teacher, frames: np.ndarray) -> np.ndarray:
+    """Median standard deviation (3,) of a teacher's labels of each landmark, as a share of the tool's length."""
+    u, covariance = teacher.project(frames)
+    sd_px = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2)
+    return np.nanmedian(sd_px / tool_length_px(u)[..., None], axis=(0, 1))
+
+
 def frame_means(share: np.ndarray) -> np.ndarray:
     """(m,) means over the landmarks of shares (m, ...) of the tool's length, each limited to a tenth; NaN is ignored."""
     return np.ma.masked_invalid(np.minimum(share, _CAP).reshape(len(share), -1)).mean(axis=1).filled(np.nan)
 
 
-def agreement(teacher: Teacher, seen: Seen) -> Agreement:
-    """The agreement of detections with a teacher, without frames that it refused.  A `RefusalError` if it labels none."""
+def agreement(teacher: Teacher, seen: Seen, fewest: int = 1) -> Agreement:
+    """The agreement of detections with a teacher; a `RefusalError` if it labels fewer than `fewest` of their frames."""
     u, covariance, shown = teacher.labels(seen.frame)
     is_labelled = np.isfinite(u).all(axis=-1) & (shown > 0)
-    if not is_labelled.any():
-        raise RefusalError(f"robot: it labels none of the {len(seen.frame)} frames that are kept for stopping or judging.")
+    if (n := is_labelled.any(axis=(1, 2)).sum()) < fewest:
+        raise RefusalError(
+            f"robot: it labels {n} of the {len(seen.frame)} frames that are kept for stopping or judging; in the others the "
+            "log stands still or is silent, or the tool is out of view. Record longer, or end while the tool moves in view."
+        )
     found, labels = seen.u.reshape(-1, 3, 2), np.where(is_labelled[..., None], u, np.nan).reshape(-1, 3, 2)
     sigmas = np.sqrt(nees(found, labels, (covariance + seen.covariance).reshape(-1, 3, 2, 2)) / 2).reshape(is_labelled.shape)
     return Agreement(errors_px(found, labels).reshape(is_labelled.shape), sigmas, tool_length_px(u)[..., None])

@@ -16,6 +16,7 @@ from lib.recordings.annotations import CLICK_SD_PX
 
 #: A detected tool stands still if it is in the same place, within this share of its length, in at least 4 frames.
 _STILL, _STILL_FRAMES = 0.15, 4
+_SURE, _FEWEST_IMAGES = 0.5, 5  # least confidence of tips, and number of images with two such, that show an exchange
 #: The base has no edge that ends along the shaft.  A detector's constant error there is this multiple of its stated standard
 #: deviation, if that exceeds `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools, also by two other renderers.
 _BASE_BIAS = 2.0
@@ -103,6 +104,15 @@ def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
             spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
             found[i, side] = spread[1] > least_mm
     return found
+
+
+def exchanged_tips(seen: Seen, labels: Seen) -> bool:
+    """True if in most labelled images the detected tips lie at the labels with tip_1 and tip_2 exchanged."""
+    seen = seen.of(labels.frame)
+    off = (seen.u[:, :, 1:] - labels.u[:, :, tips] for tips in ([1, 2], [2, 1]))
+    straight, crossed = (np.linalg.norm(one, axis=-1).mean(axis=2) for one in off)
+    sure = (seen.confidence[:, :, 1:] >= _SURE).all(axis=2) & np.isfinite(straight)
+    return bool(sure.sum() >= _FEWEST_IMAGES and (crossed < 0.5 * straight)[sure].mean() > 0.8)
 
 
 def look_elsewhere(

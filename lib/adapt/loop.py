@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
-from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
+from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, sd_share, stretches
+from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
 from lib.adapt.teacher import LABEL, OtherBaseError, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
@@ -31,7 +31,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 28  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 29  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -54,6 +54,9 @@ _GUIDED, _SETTLED = 3, 0.01
 _ANGLED = np.cos(np.radians(12.0))  # the jaws are angled if the cosine between shaft and tips is smaller
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
 _UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which it asks for clicks
+#: Largest standard deviation of a landmark's label without labels set by hand, as a share of the tool's length; and if the
+#: detector marks another point than the base, largest distance of the measured end of the shaft from it.
+_VAGUE, _CONFIRMED = 0.05, 0.03
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
@@ -139,10 +142,11 @@ def adapt_images(
             raise ValueError(f"{labels}: image {name} has keypoints {names}; {list(LANDMARKS)} are needed.")
         xyv = values[[names.index(landmark) for landmark in LANDMARKS]]
         u, shown = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan), shown_by_coco(xyv[:, 2].astype(int))
-        marked.append(LabelledImage(name, read_image(images / name), u, shown, CLICK_SD_PX))
+        if np.isfinite(tool_length_px(u)):
+            marked.append(LabelledImage(name, read_image(images / name), u, shown, CLICK_SD_PX))
     n = len(marked)
     if n < 10:
-        raise ValueError(f"{labels}: {n} labelled images; label at least 10.")
+        raise ValueError(f"{labels}: {n} images with a labelled base and tip; label at least 10.")
     second = min(round(0.8 * n), n - 3)
     first = min(round(0.65 * n), second - 2)
     parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
@@ -182,6 +186,7 @@ class _Work:
         self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
         self.shaft: ShaftEnd | None = None
         self.axis: np.ndarray | None = None  # of the shaft, in the tool's axes
+        self.knows_base = True  # False: the detector marks another point for the base
         self.simulated: list[LabelledImage] = []  # simulated frames in the colours of this recording
         self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
@@ -195,6 +200,7 @@ class _Work:
         self.looks_near = self.learns and bool(self.detector.closeup_network)
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
+        key += [recording.robot_accuracy_mm]
         shown = (recording.frames[int(i)] for i in self.frames[::12])  # changed images in the same folder need new work
         key += [recording.kinematics.time_s.tobytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in shown)]
         digest = getattr(self.detector, "digest", "")  # of the detector that learns
@@ -269,16 +275,19 @@ class _Work:
         self.labels[np.setdiff1d(self.frames, still)], self.marked = np.nan, np.intersect1d(self.marked, still)
         # Few labels only replace the detections of their landmarks.
         by_hand, few = (None, self.labels) if len(self.marked) < _OVERRULE else (Seen.by_hand(self.labels), nothing)
-        parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
+        parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s, len(self.marked))
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
+        if by_hand is not None and exchanged_tips(first, by_hand):
+            raise RefusalError("labels: in most images tip_1 is where the detector sees tip_2. Exchange the two labels.")
         try:
             teacher = self.taught(seen.labelled(few).of(learn), by_hand)
             if self.contradicted(teacher):
                 raise RefusalError("labels: detector and robot agree with each other, but not with the labels; check both.")
-        except RefusalError:
+        except RefusalError as refused:
             if by_hand is None:
                 raise
+            self.report["notes"].append(f"The cameras are estimated from the labels alone. {refused}")
             teacher = teach(recording, None, by_hand=by_hand)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
@@ -299,16 +308,24 @@ class _Work:
                 break
         if by_hand is None:  # else the labels tell where the base is
             self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
+            if (sd := sd_share(teacher, learn)).max() > _VAGUE:
+                what = f"{LANDMARKS[sd.argmax()]} only to {100 * sd.max():.0f} % of the tool's length (standard deviation)"
+                raise RefusalError(f"detector: with the robot it gives {what}. {LABEL}")
+            if not self.knows_base and (self.shaft is None or abs(self.shaft.moved) > _CONFIRMED):
+                what = "it marks another point than the base of these angled jaws, and the base that was searched instead"
+                raise RefusalError(f"detector: {what} is not where the aligned frames show the end of the shaft. {LABEL}")
             moved, teacher = teacher, teacher.with_base(self.shaft)
             shift_mm = teacher.offset_mm[0] - moved.offset_mm[0]
             self.report["base_moved_mm"] = 0.0 if self.shaft is None else float(shift_mm @ self.shaft.axis)
         self.report["refused_frames"] = teacher.refused
+        agreement(teacher, first.of(parts["judge"]), fewest=3)  # else training is in vain
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
         some = learn[:: max(1, len(learn) // 8)]
         self.simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
         for k in range(1, ROUNDS + 1):
-            if k > 1 and self.left_s < 6 * self.minutes:
+            begun = (self.folder / f"round {k}").is_dir()  # before a kill
+            if k > 1 and not begun and self.left_s < 6 * self.minutes:
                 break
             tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
             seen, refusal = self.look(f"round {k}", tuned, self.frames), {}
@@ -349,6 +366,7 @@ class _Work:
                 raise refused from None
             if self.axis[0] > _ANGLED:
                 raise
+            self.knows_base = False
             self.report["notes"].append(
                 f"The shaft points {np.degrees(np.arccos(self.axis[0])):.0f} degrees away from the tips, and the detector "
                 "marks another point than the base, perhaps the kink of the jaws. So the base was searched near the robot's."
@@ -370,10 +388,10 @@ class _Work:
 
     def contradicted(self, teacher: Teacher) -> bool:
         """True if a teacher's landmarks are too far from labels set by hand."""
-        labels = self.labels[self.marked]
-        off = np.linalg.norm(teacher.project(self.marked)[0] - labels, axis=-1)
-        off /= np.maximum(_OFF_LABELS * tool_length_px(labels), _OFF_LABELS_PX)[..., None]
-        return len(self.marked) >= _OVERRULE and np.nanmedian(off) > 1
+        told = teacher.project(self.marked)[0]
+        off = np.linalg.norm(told - self.labels[self.marked], axis=-1)
+        off /= np.maximum(_OFF_LABELS * tool_length_px(told), _OFF_LABELS_PX)[..., None]
+        return len(self.marked) >= _OVERRULE and np.isfinite(off).any() and np.nanmedian(off) > 1
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on the teacher's labels of the frames for learning."""
@@ -387,7 +405,8 @@ class _Work:
             held_out += self.images(doubt_on, teacher, seen)
         # The robot's labels have the same error in all frames.  The networks learn it, so it is no noise of held-out labels.
         held_out = [one._replace(sd_px=0.0) for one in held_out]
-        images = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
+        late = self.marked[self.marked >= parts["stop"][0]]  # among the frames for judging, so no training sees them
+        images = self.images(np.setdiff1d(parts["learn"], np.append(doubt_on, late)), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to train on, {len(held_out)} others; 8 and 4 suffice.")
         done = {}
@@ -413,7 +432,9 @@ class _Work:
         """Compare both detectors on the frames for judging, which took no part in teaching or stopping."""
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements = [agreement(teacher, own) for own in seen]
+        unlabelled = np.isnan(agreements[0].distance_px).any(axis=1)  # there a detector may rightly find nothing
         distances = epipolar_px(self.recording, seen, best_seen.of(self.parts["learn"]))
+        distances = [np.where(unlabelled, np.nan, own) for own in distances]
         length = agreements[0].length_px.mean(axis=1)
         told, spread = teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))
@@ -436,7 +457,7 @@ class _Work:
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),
             "judged": {
-                name: own.summary() | {"epipolar_px": float(np.median(distance))}
+                name: own.summary() | {"epipolar_px": float(np.nanmedian(distance))}
                 for name, own, distance in zip(("before", "after"), agreements, distances, strict=True)
             },
             "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},

@@ -98,8 +98,7 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     if min(map(len, parts)) < 0.15 * len(frames) or own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
-    what = f"The cameras moved, or the tool slipped, at about frame {first}"
-    return kept, f"{what}: only frames {kept[0]} to {kept[-1]} are used."
+    return kept, f"The cameras moved or the tool slipped at frame {first}: only frames {kept[0]} to {kept[-1]} are used."
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,12 +223,14 @@ def teach(
             robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
-    refused = _frozen(recording, seen.frame)
+    refused = _frozen(recording, np.arange(len(recording)))
     if before is not None:
         recording, refused = before.recording, np.union1d(refused, before.refused)
-    used = seen.of(np.setdiff1d(seen.frame, refused))
+    in_both = np.isfinite(seen.u).all(axis=3).any(axis=2).all(axis=1)
+    used = seen.of(np.setdiff1d(seen.frame[in_both] if alone else seen.frame, refused))
     if len(used.frame) < 5:
-        raise RefusalError(f"kinematics: the log stands still in {len(refused)} of {len(seen.frame)} frames; check it.")
+        few = f"in {len(used.frame)} of {len(seen.frame)} frames the robot moves"
+        raise RefusalError(f"labels: only {few} and both images are labelled. {LABEL}" if alone else f"log: only {few}.")
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
@@ -405,7 +406,8 @@ def _by_labels(recording: Recording, seen: Seen) -> Calibration:
             except _POOR:  # shut jaws have no axes
                 return _fitted(recording, seen, ransac_px=np.inf)
     except _POOR as error:
-        raise RefusalError(f"labels: no cameras agree with them ({error}). {LABEL}") from error
+        reason = str(error).partition(". ")[0]  # without the cure, which is to adapt
+        raise RefusalError(f"labels: no cameras agree with them ({reason}). {LABEL}") from error
 
 
 def _by_detections(recording: Recording, seen: Seen) -> Calibration:

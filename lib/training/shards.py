@@ -118,13 +118,18 @@ def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int 
     return [np.concatenate(arrays) for arrays in zip(*shards, strict=True)]
 
 
-def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:
-    """Encode images, at most `long_side_px` long, as (ends (n,), joined JPEGs, u (n, 3, 2) px, visibility (n, 3))."""
+def packed(
+    images: Iterable[LabelledImage], long_side_px: int | None = None, tool_px: float = 0.0
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Encode images as (ends (n,), joined JPEGs, u (n, 3, 2) px, visibility (n, 3)).
+
+    Images longer than `long_side_px` shrink to it, but their tools to no less than `tool_px`.
+    """
     parts = []
     for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]
-        if long_side_px and max(h, w) > long_side_px:
-            size = round(w * long_side_px / max(h, w)), round(h * long_side_px / max(h, w))
+        if long_side_px and (scale := max(long_side_px / max(h, w), np.nan_to_num(tool_px / tool_length_px(u)))) < 1:
+            size = round(scale * w), round(scale * h)
             image, u = cv2.resize(image, size, interpolation=cv2.INTER_AREA), cell_from_image(u, np.array([w, h]) / size)
         encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
         parts.append((encoded.ravel(), u, visibility))

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import cv2
 import numpy as np
@@ -46,6 +46,7 @@ class SceneSource(Source):
     `drawings.py`), and `weight` (n, 3) of the draws in which a label counts.
     """
 
+    stored_px: ClassVar[float] = 0.0  # least length of a tool in an image that `of` stores
     ends: np.ndarray
     jpegs: np.ndarray
     u: np.ndarray
@@ -63,7 +64,7 @@ class SceneSource(Source):
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """Make a source from labelled images of any size; for validation `still`: unchanged, as the detector sees them."""
-        return cls(*shards.packed(images, shards.SCENE_PX), disguise=0.0 if still else 0.5, weight=weight)
+        return cls(*shards.packed(images, shards.SCENE_PX, cls.stored_px), disguise=0.0 if still else 0.5, weight=weight)
 
     def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The frame, or a drawn tool on a ground made from it, with landmarks (3, 2) px, visibility and weight (3,)."""
@@ -135,6 +136,7 @@ class ToolSource(SceneSource):
     candidates.  In scenes with `proposals` (n, m, 3, 2) px of a first stage, padded with NaN, four in ten show a proposal.
     """
 
+    stored_px: ClassVar[float] = 60.0  # the windows show tools with about this length
     proposals: np.ndarray | None = None
 
     @classmethod

@@ -14,7 +14,7 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, judging, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
-from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
+from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.correspondences import DataError
 from lib.geometry import RigidTransform
@@ -74,6 +74,8 @@ def test_stretches_are_disjoint_in_time():
     with pytest.raises(RefusalError, match="too few"):
         stretches(np.arange(16), time_s)
     assert len(stretches(np.arange(17), time_s)["judge"]) == 3  # fewer frames tell no gain from chance
+    parts = stretches(np.arange(12), np.arange(12.0), labelled=5)  # what is labelled is for learning
+    assert len(parts["judge"]) == 3 and len(parts["stop"]) >= 2
 
 
 def test_half_wrong_detections_give_right_labels(world, recording):
@@ -235,9 +237,16 @@ class LaterStages(StandIn):
         return self(images)
 
 
-@pytest.mark.parametrize(("angled", "found"), [(True, True), (False, True), (True, False)])
+def end_at(world, base):
+    """The end of a shaft that points to the tips, in all frames of a world."""
+    pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
+    along = world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0]
+    return ShaftEnd(np.arange(world.n), base, AHEAD, along, 0.01, 0.01, pictures, outline)
+
+
+@pytest.mark.parametrize(("angled", "found", "shown"), [(1, 1, 1), (0, 1, 1), (1, 0, 1), (1, 1, 0)])
 def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_the_robot_reports_it(
-    world, recording, tmp_path, monkeypatch, angled, found
+    world, recording, tmp_path, monkeypatch, angled, found, shown
 ):
     kinks = world.u.copy()
     kinks[:, :, 0] += 0.2 * (world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0])
@@ -264,9 +273,11 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
     monkeypatch.setattr(loop, "Detector", Kinked)
     monkeypatch.setattr(loop, "teach", refusing)
     monkeypatch.setattr(loop, "shaft_axis", lambda *_: np.array([0.8, 0.6, 0.0]) if angled else AHEAD)
+    monkeypatch.setattr(loop, "shaft_end", lambda *_: end_at(world, world.u[:, :, 0]) if shown else None)
     work = {"folder": tmp_path, "progress": False, "tune": tune}
     report = adapt(recording, Kinked(kinks, noise_px=0.7), **work).report
-    assert ("training starts" if angled and found else "it sees base") in report["reason"]
+    reason = "training starts" if shown else "is not where the aligned frames show the end of the shaft"
+    assert (reason if angled and found else "it sees base") in report["reason"]
     assert any("37 degrees away from the tips" in note for note in report["notes"]) == (angled and found)
     if angled:  # the first look at each frame is along the tips, the second one along the shaft
         tips, shaft = (one[:, 1:].mean(axis=1) - one[:, 0] for one in (asked[0], asked[report["frames"]["learn"]]))
@@ -348,9 +359,10 @@ def test_what_an_older_recipe_kept_is_not_gone_on_with(world, recording, tmp_pat
 def test_other_images_in_the_same_folder_are_other_work(world, recording, tmp_path):
     exchanged = Kept(world.time_s)
     exchanged._pairs = [pair[::-1] for pair in exchanged._pairs]
-    for one in (recording, recording, replace(recording, frames=exchanged)):
+    noisier = replace(recording, robot_accuracy_mm=0.02)  # so its labels have another weight
+    for one in (recording, recording, replace(recording, frames=exchanged), noisier):
         assert not adapt(one, StandIn(world.u, noise_px=0.7, wrong=1.0), folder=tmp_path, progress=False).improved
-    assert len(list((tmp_path / "work").iterdir())) == 2
+    assert len(list((tmp_path / "work").iterdir())) == 3
 
 
 class Sure(StandIn):
@@ -456,6 +468,42 @@ def test_an_adaptation_is_kept_only_if_left_and_right_agree_better(world, record
     assert found.improved == (factor < 1) == ("do not agree better" not in found.report["reason"])
 
 
+def test_what_is_not_in_the_image_need_not_be_found(world, recording, tmp_path, monkeypatch):
+    """The detector marks a base out of view before the training, and rightly nothing afterwards."""
+    def partly(teacher, seen, **how):
+        found = judging.agreement(teacher, seen, **how)
+        found.distance_px[:2, :, 0] = np.nan
+        return found
+
+    def epipolar(_, seen, __):
+        before, after = (np.full((len(one.frame), 3), px) for one, px in zip(seen, (1.0, 0.5), strict=True))
+        after[:2, 0] = np.inf
+        return [before, after]
+
+    monkeypatch.setattr(loop, "agreement", partly)
+    monkeypatch.setattr(loop, "epipolar_px", epipolar)
+    found = adapt(recording, StandIn(world.u, wrong=0.5), folder=tmp_path, progress=False, tune=pupil(world))
+    assert found.improved and found.report["judged"]["after"]["epipolar_px"] == 0.5
+
+
+def test_a_log_that_is_silent_in_the_frames_for_judging_is_said_before_the_training(world, tmp_path):
+    tune = pupil(world)
+    silent = world.record(tmp_path / "silent", robot=lambda time_s, x: np.where((time_s > 15.5)[:, None, None], np.nan, x))
+    found = adapt(silent, StandIn(world.u, noise_px=0.7), folder=tmp_path, progress=False, tune=tune)
+    assert "labels 0 of the" in found.report["reason"] and "Record longer" in found.report["reason"] and not tune.calls
+    assert set(range(33, 39)) <= set(found.report["refused_frames"])
+
+
+def test_a_round_that_a_kill_interrupted_goes_on_although_its_time_is_short(world, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "ROUNDS", 2)
+    monkeypatch.setattr(loop, "_LEAST_GAIN", -1.0)  # no round is the last
+    work = {"folder": tmp_path, "progress": False, "minutes": 1e-3}
+    assert len(adapt(recording, StandIn(world.u, wrong=0.5), tune=pupil(world), **work).report["rounds"]) == 2
+    (only,) = (tmp_path / "work").iterdir()
+    (only / "round 2").mkdir()
+    assert len(adapt(recording, StandIn(world.u, wrong=0.5), tune=pupil(world), **work).report["rounds"]) == 3
+
+
 def test_a_half_wrong_detector_is_improved(continued):
     found, detector, tune = continued
     assert found.improved and found.detector is not detector and found.calibration is not None
@@ -524,7 +572,8 @@ def test_labels_are_used_of_one_stand_of_the_cameras_and_some_frames_stay_to_jud
     detector = StandIn(there.u, wrong=0.3)
     found = adapt(there_too, detector, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
     assert np.nanquantile(np.linalg.norm(tune.calls[-1]["off"], axis=-1), 0.95) < 1.5
-    learnt = found.frames["learn"]
+    learnt, trained = found.frames["learn"], [int(one.name.split()[1]) for one in tune.calls[-1]["images"]]
+    assert max(trained) < found.frames["stop"][0]  # a labelled frame beside one for judging shows nearly the same
     assert np.isin(some, learnt).sum() >= used and len(found.frames["judge"]) >= 3 and (learnt < (moved_from or 40)).all()
 
 
@@ -613,6 +662,29 @@ def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(lengt
             assert loop._Work.contradicted(work, teacher) == (contradicts and n == 5)
 
 
+def test_a_teacher_without_a_labelled_base_is_compared_with_the_tips():
+    told = np.tile([[100.0, 100.0], [400.0, 100.0], [400.0, 100.0]], (5, 2, 1, 1))
+    labels = told + [[np.nan, np.nan], [0, 20], [0, 20]]
+    work = SimpleNamespace(labels=labels, marked=np.arange(5))
+    assert loop._Work.contradicted(work, SimpleNamespace(project=lambda frames: (told[frames], None)))
+
+
+def test_labels_with_exchanged_tips_are_called_so(world, recording, tmp_path):
+    u, by_hand = five_labelled(world)
+    seen = look(recording, StandIn(world.u, noise_px=0.7, wrong=0.3), np.arange(world.n))
+    assert not exchanged_tips(seen, by_hand)
+    write_coco(tmp_path / "labels.json", Annotations(*np.moveaxis(u[:, :, [0, 2, 1]], 1, 0)), SIZE, ".png")
+    how = {"labels": tmp_path / "labels.json", "folder": tmp_path, "progress": False, "tune": pupil(world)}
+    assert "Exchange the two labels" in adapt(recording, StandIn(world.u, noise_px=0.7), **how).report["reason"]
+
+
+def test_labels_of_one_camera_ask_for_the_other(world, recording):
+    u = np.full(world.u.shape, np.nan)
+    u[::4, 0] = world.u[::4, 0]
+    with pytest.raises(RefusalError, match="only in 0 of 10 frames the robot moves and both images are labelled"):
+        teach(recording, None, by_hand=Seen.by_hand(u))
+
+
 def test_labels_that_leave_the_places_open_are_refused(world, recording, tmp_path, monkeypatch):
     """Those that are a start elsewhere in this file, where no place is told so well as is asked for."""
     monkeypatch.setattr("lib.adapt.teacher.NEAR", 0.001)
@@ -622,6 +694,13 @@ def test_labels_that_leave_the_places_open_are_refused(world, recording, tmp_pat
     lost = StandIn(world.u, wrong=0.97)
     found = adapt(recording, lost, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=pupil(world))
     assert re.search(r"labels: .* error of [0-9]+ % of the tool's length \(sd\). Label 10 pairs", found.report["reason"])
+
+
+def test_a_landmark_that_robot_and_detector_leave_open_asks_for_labels(world, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_VAGUE", 0.002)
+    how = {"folder": tmp_path, "progress": False, "tune": pupil(world)}
+    reason = adapt(recording, StandIn(world.u, noise_px=0.7), **how).report["reason"]
+    assert re.search(r"gives (base|tip_.) only to [0-9]+ % of the tool's length .* Label 10 pairs", reason)
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
@@ -759,9 +838,7 @@ def test_the_end_of_the_shaft_corrects_a_base_that_detector_and_robot_leave_open
         return x + np.einsum("mij,kj->mki", carried(tool_axes(x), x, time_s), offset_mm)
 
     recording = world.record(tmp_path / "lab", robot=robot)
-    pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
-    along = world.u[:, :, 1:].mean(axis=2) - world.u[:, :, 0]
-    end = ShaftEnd(np.arange(world.n), world.u[:, :, 0], AHEAD, along, 0.01, 0.01, pictures, outline)
+    end = end_at(world, world.u[:, :, 0])
     monkeypatch.setattr(loop, "shaft_end", lambda *_: end if shown else None)
     found = adapt(recording, StandIn(world.u, noise_px=0.7), folder=tmp_path, progress=False, tune=pupil(world))
     exact = world.u[found.frames["judge"]]
@@ -790,6 +867,11 @@ def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
     write_coco(tmp_path / "ten.json", Annotations(u[:20, 0], np.full_like(u[:20, 1], np.nan)), SIZE, ".png")
     ten = loop.adapt_images(recording.folder, tmp_path / "ten.json", **how)
     assert ten.report["frames"] == {"learn": 5, "stop": 2, "judge": 3} and np.isfinite(ten.report["gain"]["labels"][1])
+    absent = np.where(np.arange(20)[:, None] < 9, 2, -1) * np.ones(3, int)
+    one_eye = Annotations(u[:20, 0], np.full_like(u[:20, 1], np.nan), absent, 0 * absent)
+    write_coco(tmp_path / "nine.json", one_eye, SIZE, ".png")
+    with pytest.raises(ValueError, match="at least 10"):  # images without a tool cannot judge
+        loop.adapt_images(recording.folder, tmp_path / "nine.json", StandIn(world.u), folder=tmp_path, tune=tune)
     with pytest.raises(ValueError, match="at least 10"):
         loop.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
 

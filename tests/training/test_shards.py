@@ -7,7 +7,7 @@ import pytest
 
 from lib.training import shards
 from lib.training.samples import LabelledImage
-from lib.training.sources import CloseupSource
+from lib.training.sources import CloseupSource, FrameSource, ToolSource
 
 
 def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkeypatch, tmp_path):
@@ -28,6 +28,14 @@ def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkey
     with np.load(tmp_path / "closeups_0000.npz") as shard:
         own = shard["crop_u"][np.arange(400), shard["crop_landmark"]]
     assert np.abs(own - 63.5).max() <= 0.5
+
+
+def test_a_small_tool_in_a_large_frame_is_stored_as_large_as_its_window_shows_it():
+    u = np.array([[900.0, 500.0], [990.0, 510.0], [990.0, 490.0]])
+    frame = LabelledImage("small", np.zeros((1080, 1920, 3), np.uint8), u, np.full(3, 2))
+    image, at, *_ = ToolSource.of([frame]).frame(0)
+    assert 55 < np.linalg.norm(at[1:].mean(axis=0) - at[0]) < 62 and 1200 < image.shape[1] < 1300
+    assert FrameSource.of([frame]).frame(0)[0].shape[1] == shards.SCENE_PX  # the first stage shrinks all
 
 
 def test_closeups_are_stretched_with_their_landmark(tmp_path):
