@@ -86,16 +86,19 @@ class _Film:
         self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
             stream = container.streams.video[0]
-            times = [(p.pts, p.dts) for p in container.demux(stream) if p.size and not p.is_discard]
-            stated, end_s = stream.frames or len(times), 0.0
+            packets = [packet for packet in container.demux(stream) if packet.size]
+            stated, end_s = stream.frames or len(packets), 0.0
             if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states only its duration
                 end_s = (container.duration or 0) / av.time_base
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
+        times = [(p.pts, p.dts) for p in packets if not p.is_discard]  # a trimmed .mp4 still holds what it does not show
         which = int(any(pts is None for pts, _ in times))  # .avi has only times of decoding (dts)
         self.stamps = [Decimal(t) * base for t in sorted(pair[which] for pair in times if pair[which] is not None)]
         step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
-        if len(self.stamps) != stated or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
-            raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {stated} ({end_s:.1f} s). Copy it again.")
+        whole = len(packets) == stated and 0 < len(self.stamps) == len(times)
+        if not whole or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
+            what = f"{len(packets)} frames of {stated} ({end_s:.1f} s)"
+            raise ValueError(f"{path}: the video is cut off: {what}. Copy it again.")
 
     def _open(self) -> av.container.InputContainer:
         try:

@@ -75,11 +75,13 @@ def posed(source: Shipped) -> tuple[list[RigidTransform], np.ndarray, np.ndarray
     return poses, opening, JAWS.positions_mm(poses, opening)
 
 
-def video(path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p") -> None:
-    """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w)."""
+def video(
+    path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p", gop: int = 12
+) -> None:
+    """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w), with a key frame in each `gop` frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
-        stream.height, stream.width, stream.pix_fmt = *images.shape[1:3], pix_fmt
+        stream.height, stream.width, stream.pix_fmt, stream.gop_size = *images.shape[1:3], pix_fmt, gop
         stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
         stream.options = {"crf": "15", "preset": "ultrafast"} if codec == "libx264" else {}
         for image, time in zip(images, time_s, strict=True):
@@ -87,6 +89,17 @@ def video(path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx
             frame.pts, frame.time_base = round(time * 90000), Fraction(1, 90000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def cut(old: Path, new: Path, first: int = 0, zero_s: Fraction = Fraction(0)) -> None:
+    """Copy a video without decoding it: packets from number `first` on, times from `zero_s` on, as `ffmpeg -c copy` does."""
+    with av.open(str(old)) as source, av.open(str(new), "w", format={".ts": "mpegts"}.get(new.suffix)) as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        for packet in [packet for packet in source.demux(stream) if packet.dts is not None][first:]:
+            packet.pts, packet.dts = (round(t - zero_s / stream.time_base) for t in (packet.pts, packet.dts))
+            packet.stream = copy
+            target.mux(packet)
 
 
 def side_by_side(folder: Path, source: Shipped) -> str:

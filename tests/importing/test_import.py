@@ -4,6 +4,7 @@ import hashlib
 import json
 import tomllib
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -129,6 +130,27 @@ def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipp
     np.testing.assert_allclose(Recording.open(tmp_path / "eye").frames.time_s, time_s[kept], atol=1.1e-3)  # .mkv counts ms
     assert any("1 frames without a partner" in line for line in report["did"])
     assert any("frame rate varies" in line for line in report["did"])
+
+
+def brightnesses(count: int) -> np.ndarray:
+    """Frames (count, 48, 128, 3) of both views, each brighter than the one before by 8."""
+    return np.repeat(8 * np.arange(count, dtype=np.uint8) + 10, 48 * 128 * 3).reshape(count, 48, 128, 3)
+
+
+def shown_numbers(folder: Path) -> list[tuple[int, int]]:
+    """For each frame of a recording of `brightnesses` at 25 fps: the number of the picture, and that of its time."""
+    return [(round((frame.left.mean() - 10) / 8), round(25 * frame.time_s)) for frame in Recording.open(folder).frames]
+
+
+def test_a_trimmed_video_gives_the_frames_that_it_shows(shipped, tmp_path):
+    """`ffmpeg -ss 0.2 -i whole.mp4 -c copy stereo.mp4` copies frames from the key frame before, which nobody shall see."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    foreign.video(tmp_path / "whole.mp4", brightnesses(20), np.arange(20) / 25)
+    foreign.cut(tmp_path / "whole.mp4", folder / "stereo.mp4", zero_s=Fraction(1, 5))
+    video = '[video]\nlayout = "side_by_side"\nfile = "stereo.mp4"\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    assert shown_numbers(tmp_path / "eye") == [(5 + i, i) for i in range(15)]
 
 
 def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
