@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
@@ -92,13 +93,17 @@ class _Film:
                 end_s = (container.duration or 0) / av.time_base
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
         times = [(p.pts, p.dts) for p in packets if not p.is_discard]  # a trimmed .mp4 still holds what it does not show
-        which = int(any(pts is None for pts, _ in times))  # .avi has only times of decoding (dts)
-        self.stamps = [Decimal(t) * base for t in sorted(pair[which] for pair in times if pair[which] is not None)]
-        step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
-        whole = len(packets) == stated and 0 < len(self.stamps) == len(times)
-        if not whole or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
+        counted = any(pts is None for pts, _ in times)  # .avi has only times of decoding (dts), which frames do not carry
+        ticks = sorted(pair[counted] for pair in times if pair[counted] is not None)
+        last_s, span_s = (float((ticks[-1] - zero) * base) for zero in (0, ticks[0])) if ticks else (0.0, 0.0)
+        whole = len(packets) == stated and 0 < len(ticks) == len(times)
+        if not whole or (end_s and last_s + 2.5 * span_s / max(len(times) - 1, 1) + 0.2 < end_s):
             what = f"{len(packets)} frames of {stated} ({end_s:.1f} s)"
             raise ValueError(f"{path}: the video is cut off: {what}. Copy it again.")
+        first = None if counted else next(self._decoded(), None)
+        if first and first.pts in ticks:  # nothing before the first key frame can be decoded
+            ticks = ticks[ticks.index(first.pts) :]
+        self.stamps, self._ticks = [tick * base for tick in ticks], [] if counted else ticks
 
     def _open(self) -> av.container.InputContainer:
         try:
@@ -114,22 +119,25 @@ class _Film:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        with self._open() as container:
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        """The frames that the decoder gives, up to one that it cannot decode."""
+        with self._open() as container, suppress(av.error.FFmpegError):
             container.streams.video[0].thread_type = "AUTO"
-            frames, wanted = container.decode(video=0), set(map(int, wanted))
-            for index in range(max(wanted) + 1):
-                try:
-                    frame = next(frames)
-                except (StopIteration, av.error.FFmpegError):
-                    what = f"frame {index} of {len(self)} cannot be decoded"
-                    raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.") from None
-                if frame.is_corrupt:
-                    raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
-                if index in wanted:
-                    deep = max(c.bits for c in frame.format.components) == 16
-                    # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
-                    yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+            yield from container.decode(video=0)
+
+    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
+        frames, wanted = self._decoded(), set(map(int, wanted))
+        for index in range(max(wanted) + 1):
+            frame = next(frames, None)
+            if frame is None or (self._ticks and frame.pts != self._ticks[index]):
+                what = f"frame {index} of {len(self)} cannot be decoded"
+                raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.")
+            if frame.is_corrupt:
+                raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
+            if index in wanted:
+                deep = max(c.bits for c in frame.format.components) == 16
+                # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
+                yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
 
 
 @dataclass(frozen=True, eq=False)

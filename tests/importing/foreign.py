@@ -92,7 +92,7 @@ def video(
 
 
 def cut(old: Path, new: Path, first: int = 0, zero_s: Fraction = Fraction(0)) -> None:
-    """Copy a video without decoding it: packets from number `first` on, times from `zero_s` on, as `ffmpeg -c copy` does."""
+    """Copy a video as `ffmpeg -c copy` does: packets from number `first` on, times from `zero_s` on."""
     with av.open(str(old)) as source, av.open(str(new), "w", format={".ts": "mpegts"}.get(new.suffix)) as target:
         stream = source.streams.video[0]
         copy = target.add_stream_from_template(stream)

@@ -153,6 +153,26 @@ def test_a_trimmed_video_gives_the_frames_that_it_shows(shipped, tmp_path):
     assert shown_numbers(tmp_path / "eye") == [(5 + i, i) for i in range(15)]
 
 
+@pytest.mark.parametrize("name", ["stereo.ts", "stereo.mkv", "stereo.avi"])
+def test_frames_keep_their_times_in_a_video_that_was_cut_between_key_frames(name, shipped, tmp_path):
+    """The decoder drops what stands before the first key frame, number 10; an .avi gives no times to match."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    if name == "stereo.avi":
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*"XVID"), 25, (128, 48))
+        for image in brightnesses(24):
+            writer.write(image)
+        writer.release()
+    else:
+        foreign.video(tmp_path / "whole.mp4", brightnesses(24), np.arange(24) / 25, gop=10)
+        foreign.cut(tmp_path / "whole.mp4", folder / name, first=4)
+    video = f'[video]\nlayout = "side_by_side"\nfile = "{name}"\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    shown = shown_numbers(tmp_path / "eye")
+    late = 0 if name == "stereo.avi" else 10
+    assert shown == [(i, i) for i in range(late, 24)]
+
+
 def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     """Numbers count frames: later pairs neither move in time nor get another's image."""
     folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
