@@ -186,11 +186,19 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
-    """Frame numbers from 0 in each source, with gaps if all steps of the images' numbers are multiples of the usual step."""
-    steps = [np.diff([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
-    usual = max(np.median(np.concatenate(steps)) if any(map(len, steps)) else 1, 1)
-    even = all(len(own) + 1 == len(reel) and not (own % usual).any() for own, reel in zip(steps, reels, strict=True))
-    return [np.cumsum([0, *own // usual]) if even else np.arange(len(reel)) for own, reel in zip(steps, reels, strict=True)]
+    """Frame numbers in each source, with gaps if all steps of the images' numbers are multiples of the usual step.
+
+    Numbers count from the lowest of both cameras if their ranges overlap, else from 0 in each.
+    """
+    numbers = [np.array([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
+    steps = np.concatenate([np.diff(own) for own in numbers])
+    usual = max(np.median(steps), 1) if steps.size else 1
+    if (steps % usual).any() or any(len(own) != len(reel) for own, reel in zip(numbers, reels, strict=True)):
+        return [np.arange(len(reel)) for reel in reels]
+    first, ends = [own[0] for own in numbers], [own[-1] for own in numbers]
+    if max(first) <= min(ends) and not np.ptp(first) % usual:
+        first = [min(first)] * len(reels)
+    return [(own - start) // usual for own, start in zip(numbers, first, strict=True)]
 
 
 def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:

@@ -188,6 +188,23 @@ def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     assert any("1 frames without a partner" in line for line in report["did"])
 
 
+@pytest.mark.parametrize(("first", "numbers"), [(3, range(3, 10)), (101, range(7))])
+def test_images_of_a_trigger_counter_pair_by_number_where_one_camera_starts_later(first, numbers, shipped, tmp_path):
+    """Where no number is in both cameras, the first images are taken for one instant, and `did` says so."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for name, start, shown in (("left", 0, range(10)), ("right", first, numbers)):
+        for i, brightness in enumerate(shown):
+            cv2.imwrite(str(folder / f"{name}_{start + i:04d}.png"), np.full((8, 8), 20 * brightness, np.uint8))
+    video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    frames = Recording.open(tmp_path / "eye").frames
+    assert (25 * frames.time_s).round().tolist() == list(numbers)
+    assert all(abs(image.mean() - 20 * 25 * f.time_s) < 3 for f in frames for image in (f.left, f.right))
+    said = [line for line in report["did"] if "left 0 and right 101 are taken for one instant. If they are not, renum" in line]
+    assert len(said) == (first == 101)
+
+
 def test_names_of_decimal_seconds_order_and_date_the_frames(shipped, tmp_path):
     """Dumps of ROS: read as one number, not by the digits after the point, which begin anew each second."""
     folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
