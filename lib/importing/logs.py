@@ -86,8 +86,8 @@ def uncommented(text: str, separator: str = "") -> list[str]:
 
 
 def separator_of(line: str) -> str:
-    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent."""
-    return max("\t;,|", key=line.count)
+    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent; without them, a space."""
+    return max("\t;,|", key=line.count) if re.search(r"[\t;,|]", line) else " "
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:

@@ -352,7 +352,7 @@ def test_a_local_time_zone_is_named(late_s, told, shipped, tmp_path):
 
 
 def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped, tmp_path):
-    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    few = replace(thinned(shipped, 10), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, path = source_of(tmp_path, few, foreign.side_by_side)
     numbers = np.column_stack([1e3 * few.robot_s, few.x_mm.reshape(len(few.x_mm), 9) / 1e3])
     rows = [";".join(f"{value:.7f}" for value in row) for row in numbers]
@@ -372,6 +372,30 @@ def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped
     path.write_text(guess_mapping(folder), "utf-8")
     told = read_mapping(path)
     assert (told.tool.estimate, told.robot.offset_s) == (True, 0.0)
+
+
+def test_the_guess_reads_integer_milliseconds_quotes_spaces_and_skips_notes(shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side)
+    (folder / "notes.txt").write_bytes("Prüfung\n".encode("cp1252") * 9999)
+    columns = [f"{name}_{axis}" for name in LANDMARKS for axis in "xyz"]
+    values = np.column_stack([np.arange(len(few.robot_s)), few.x_mm.reshape(-1, 9)])
+    np.savetxt(folder / "log.csv", values, ["%d"] + ["%.6f"] * 9, header=" ".join(["time", *columns]))
+    (folder / "frames.txt").write_text("time [ms]\n" + "\n".join(f"{1e3 * t:.2f}" for t in few.time_s), "utf-8")
+    path.write_text(guess_mapping(folder), "utf-8")
+    told = read_mapping(path)
+    assert (told.robot.separator, told.robot.time_unit, told.video.table.file) == (" ", "ms", "frames.txt")
+    time, x_mm, *_ = logs.read_robot(folder, told)
+    assert float(time[7]) == 0.007
+    np.testing.assert_allclose(x_mm, few.x_mm, atol=1e-6)
+    quoted = ",".join(f'"{column}"' for column in ["time", *columns])
+    np.savetxt(folder / "log.csv", values, "%.6f", ",", header=quoted, comments="")
+    path.write_text(guess_mapping(folder), "utf-8")
+    np.testing.assert_allclose(logs.read_robot(folder, read_mapping(path))[1], few.x_mm, atol=1e-6)
+    (folder / "log.csv").write_bytes((folder / "log.csv").read_bytes() + b"\xb5")  # now the log may be what cannot be read
+    (folder / "notes.txt").unlink()
+    with pytest.raises(ValueError, match=r"log\.csv, line \d+: the text is not UTF-8"):
+        guess_mapping(folder)
 
 
 @pytest.mark.parametrize("column", ["{name}_{axis}_cm", "{name} {axis} [cm]", "{name}.{axis}(CM)"])
