@@ -295,6 +295,21 @@ def test_a_quaternion_of_any_name_is_no_point(shipped, tmp_path):
     assert pose["rotation"] == [f"pose.ori_{axis}" for axis in "xyzw"] and pose["position"] == ["px", "py", "pz"]
 
 
+def test_a_quaternion_of_zeros_is_a_gap(shipped, tmp_path):
+    """So robots report a rotation that they do not know."""
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_poses, lambda *_: HINGE)
+    log = folder / "pose.tsv"
+    header, *rows = log.read_text().splitlines()
+    cells = [row.split("\t") for row in rows]
+    rows[:5] = ["\t".join([*row[:4], "0", "0", "0", "0", row[8]]) for row in cells[:5]]
+    log.write_text("\n".join([header, *rows]))
+    did = import_recording(folder, mapping, tmp_path / "eye")["did"]
+    assert any("; 5 have gaps (an empty cell, or a quaternion of zeros)." in line for line in did)
+    found = Recording.open(tmp_path / "eye").kinematics.x_mm
+    assert np.isnan(found[:5]).all() and np.isfinite(found[5:]).all()
+
+
 @pytest.mark.parametrize(("ends", "kind"), [
     (["q0", "q1", "q2", "q3"], "quaternion_wxyz"),
     ([f"rot[{i}][{j}]" for i in range(3) for j in range(3)], "matrix"),
