@@ -144,12 +144,13 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
     places = {name: name.partition(":")[::2] for name in (table.time, *names)}  # topic and field
     found: dict[str, list] = {name: [] for name in places}
     stamps: dict[str, list[Decimal]] = {topic: [] for topic, _ in places.values()}
+    on_arrival = places[table.time][1] == "received"  # robot and recorder may have different clocks
     with _bag(path) as reader:
         if missing := sorted(set(stamps) - (there := {c.topic for c in reader.connections})):
             raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
         for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
             message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
-            header = getattr(message, "header", None)
+            header = None if on_arrival else getattr(message, "header", None)
             stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
             for name, (topic, field) in places.items():
                 if topic == c.topic:

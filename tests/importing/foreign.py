@@ -158,8 +158,8 @@ def robot_poses(folder: Path, source: Shipped) -> str:
     return POSES
 
 
-def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
-    """A ROS bag with one topic of points a landmark, in metres, stamped on the video's clock after a date."""
+def robot_bag(folder: Path, source: Shipped, version: int = 2, ahead_s: float = 0.0) -> str:
+    """A ROS bag with one topic of points a landmark, in metres, on the video's clock after a date; stamps are `ahead_s`."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -170,7 +170,8 @@ def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
     with Writer2(folder / "bag", version=9) if version == 2 else Writer1(folder / "log.bag") as writer:
         topics = [writer.add_connection(f"/{name}", stamped.__msgtype__, typestore=store) for name in LANDMARKS]
         for time, x in zip(source.robot_s, source.x_mm, strict=True):
-            ns = 1_700_000_000_000_000_000 + round(1e9 * time)
+            received_ns = 1_700_000_000_000_000_000 + round(1e9 * time)
+            ns = received_ns + round(1e9 * ahead_s)
             sequence = {} if version == 2 else {"seq": 0}
             for topic, mm in zip(topics, x, strict=True):
                 if np.isnan(mm).any():  # this topic is silent
@@ -178,7 +179,7 @@ def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
                 stamp = header(stamp=at(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="robot", **sequence)
                 message = stamped(header=stamp, point=point(*(float(v) / 1e3 for v in mm)))
                 data = store.serialize_cdr if version == 2 else store.serialize_ros1
-                writer.write(topic, ns, data(message, stamped.__msgtype__))
+                writer.write(topic, received_ns, data(message, stamped.__msgtype__))
     points = ", ".join(f'{n} = ["/{n}:point.x", "/{n}:point.y", "/{n}:point.z"]' for n in LANDMARKS)
     file = "bag" if version == 2 else "log.bag"
     return (

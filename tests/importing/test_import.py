@@ -106,6 +106,16 @@ def test_a_topic_that_drops_out_leaves_its_landmark_blank(shipped, tmp_path):
     assert blank[silent][2:-2, 1].all() and not blank[:, [0, 2]].any() and blank[~silent, 1].sum() <= 2
 
 
+def test_times_of_arrival_hold_for_all_topics_of_a_bag(shipped, tmp_path):
+    """The robot's clock, which stamps the messages, is 0.2 s ahead of the recorder's."""
+    few = thinned(shipped, 20)
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, lambda *args: foreign.robot_bag(*args, ahead_s=0.2))
+    mapping.write_text(mapping.read_text("utf-8").replace("/base:header.stamp", "/base:received"), "utf-8")
+    time, x_mm, *_ = logs.read_robot(folder, read_mapping(mapping))
+    np.testing.assert_allclose(logs.since(time, time[0]), few.robot_s - few.robot_s[0], atol=1e-8)
+    np.testing.assert_allclose(x_mm, few.x_mm, atol=1e-3)
+
+
 def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
     few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
@@ -201,7 +211,7 @@ def test_images_of_a_trigger_counter_pair_by_number_where_one_camera_starts_late
     frames = Recording.open(tmp_path / "eye").frames
     assert (25 * frames.time_s).round().tolist() == list(numbers)
     assert all(abs(image.mean() - 20 * 25 * f.time_s) < 3 for f in frames for image in (f.left, f.right))
-    said = [line for line in report["did"] if "left 0 and right 101 are taken for one instant. If they are not, renum" in line]
+    said = [line for line in report["did"] if "left 0 and right 101 are taken for one instant. If they are not, re" in line]
     assert len(said) == (first == 101)
 
 
