@@ -139,6 +139,14 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
     return len(paths), lambda index: read_image(paths[index], image_size_px, bit_depth)
 
 
+def video_times(path: Path) -> np.ndarray:
+    """Times (n,) s of a video's frames after the first, by its container."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        ticks = np.sort([p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard])
+        return (ticks - ticks[:1]) * float(stream.time_base)
+
+
 def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
     """Open a video file.  Reading in order decodes each frame once; a jump seeks, or reads all between if the rate varies."""
     capture = cv2.VideoCapture(str(path))
@@ -152,10 +160,8 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
     @cache
     def steady() -> bool:
         """True if the frame rate is constant, which OpenCV assumes when it seeks."""
-        with av.open(str(path)) as container:
-            times = np.sort([packet.pts for packet in container.demux(video=0) if packet.pts is not None])
-        even = np.linspace(times[0], times[-1], len(times))
-        return bool(np.abs(times - even).max() < 0.4 * np.ptp(times) / len(times))
+        times = video_times(path)
+        return bool(np.abs(times - np.linspace(0, times[-1], len(times))).max() < 0.4 * times[-1] / len(times))
 
     def read(index: int) -> np.ndarray:
         nonlocal following
