@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -40,11 +41,11 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
     data = path.read_bytes()  # not cv2.imread: it fails on non-ASCII paths on some systems
     if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
         raise ValueError(f"{path}: the image is corrupt; a block of zeros replaces a part of it. Export it again.")
-    try:
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error:  # more pixels than OpenCV allows
-        image = None
+    image, flags = None, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    with suppress(cv2.error):  # raised for more pixels than OpenCV allows, and for no data
+        image = cv2.imdecode(coded := np.frombuffer(data, np.uint8), flags)
+        if path.suffix.lower() in (".tif", ".tiff") and cv2.imdecodemulti(coded, flags, range=(1, 2))[0]:
+            raise ValueError(f"{path}: a TIFF of several pages, of which only the first would be read. Export single files.")
     if image is None:
         raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
     _check_size(path, (image.shape[1], image.shape[0]), image_size_px)

@@ -716,6 +716,16 @@ def test_a_video_whose_times_are_not_those_of_fps_is_in_doubt(times, tmp_path):
     assert "video_times" not in {doubt.name for doubt in Recording.open(folder).doubts}
 
 
+def test_a_tiff_of_several_pages_is_refused(tmp_path):
+    one, several = tmp_path / "one.tif", tmp_path / "several.TIFF"
+    pages = np.zeros((3, 8, 8, 3), np.uint16)
+    Image.fromarray(pages[0].astype(np.uint8)).save(one)
+    assert read_image(one).shape == (8, 8, 3)
+    several.write_bytes(cv2.imencodemulti(".tiff", list(pages))[1].tobytes())
+    with pytest.raises(ValueError, match=r"several\.TIFF: a TIFF of several pages, .* Export single files\."):
+        read_image(several)
+
+
 def test_nothing_is_interpolated_in_a_gap():
     log = Kinematics(np.array([0.0, 0.01, 0.02, 3600.0, 3600.01]), np.zeros((5, 3, 3)))
     assert np.isfinite(log.at([0.015, 0.02, 1800.0, 3600.0, 3600.005])[:, 0, 0]).tolist() == [True, True, False, True, True]
