@@ -121,8 +121,8 @@ def _time(columns: dict[str, list[str]], decimal: str, longest_s: float = 3.0) -
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}
     step = np.nanmedian(np.diff(_numbers(columns[time][:100], decimal))) if len(columns[time]) > 1 else 0.0
-    units = (("s", 1), ("ms", 1e3), ("us", 1e6))
-    return {"time": time, "time_unit": next((unit for unit, per_s in units if step <= longest_s * per_s), "ns")}
+    unit = next((unit for unit, per_s in (("s", 1), ("ms", 1e3), ("us", 1e6)) if step <= longest_s * per_s), "ns")
+    return {"time": time, "time_unit": unit}
 
 
 def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refused: Exception | None) -> dict:
@@ -140,8 +140,7 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
             groups.setdefault(match[1], {})[match[2].lower()] = column
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
-        what = f"{paths[name]}: no columns end in x, y and z; it has {list(columns)}"
-        raise refused or ValueError(f"{what}. Write the mapping by hand.")
+        raise refused or ValueError(f"{paths[name]}: none of {list(columns)} end in x, y and z. Write the mapping by hand.")
     length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")
     if not length:  # a tool moves by one millimetre to some centimetres
         axes = (_numbers(columns[column], dialect["decimal"]) for column in next(iter(points.values())))

@@ -1,7 +1,7 @@
 """Reads tables of other programs (CSV of any dialect, ROS bags) with exact times, and the robot's log in mm and s."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -18,6 +18,7 @@ from lib.recordings.tables import decoded, number, rows_of
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
+_STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
@@ -46,21 +47,17 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float, unit: str = "time_unit") -> None:
+def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], unit: str, places: Sequence[str] = ()) -> None:
     """Raise a ValueError if the times of rows or frames repeat or go back, or if their median step makes `unit` doubtful."""
-    _check_order(time, [f"{where}, entry {i}" for i in range(1, len(time) + 1)])
-    step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
-    if not shortest_s <= step <= longest_s:
-        what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
-        raise ValueError(f"{where}: {what}. Check {unit}.")
-
-
-def _check_order(time: list[Decimal], places: list[str]) -> None:
-    for (before, now), place in zip(pairwise(time), places[1:], strict=True):
+    for i, (before, now) in enumerate(pairwise(time), start=1):
         if now <= before:
-            what = "repeats" if now == before else "goes back"
+            what = f"the time {'repeats' if now == before else 'goes back'} ({before} s, then {now} s)"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
-            raise ValueError(f"{place}: the time {what} ({before} s, then {now} s). {cure}.")
+            raise ValueError(f"{places[i] if places else f'{where}, entry {i + 1}'}: {what}. {cure}.")
+    step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
+    if not usual_s[0] <= step <= usual_s[1]:
+        what = f"entries are {step:.3g} s apart, {usual_s[0]} to {usual_s[1]} s is plausible"
+        raise ValueError(f"{where}: {what}. Check {unit}.")
 
 
 def uncommented(text: str, separator: str = "") -> list[str]:
@@ -116,7 +113,6 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
         values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in named])
     if not time:
         raise ValueError(f"{path}: the table has no row. Export it again.")
-    _check_order(time, places)
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True)), places
 
 
@@ -196,8 +192,9 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
     names = [name for group in groups for name in group]
     names += [] if pose is None else [*pose.rotation, *([pose.gripper] if pose.gripper else [])]
     time, columns, places = read_columns(path, robot, dict.fromkeys(names))
+    increasing(time, str(path), _STEP_S, "time_unit", places)
     if empty := [name for name in names if np.isnan(columns[name]).all()]:
-        raise ValueError(f"{path}: {', '.join(empty)} are empty in all rows. Name other columns, or fewer landmarks.")
+        raise ValueError(f"{path}: no row has a value in {', '.join(empty)}. Name other columns, or fewer landmarks.")
     x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
     x = x * _MILLIMETRES[robot.length_unit]
     x[np.isnan(x).any(axis=2)] = np.nan

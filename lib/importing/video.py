@@ -87,19 +87,16 @@ class _Film:
         self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
             stream = container.streams.video[0]
-            packets = [packet for packet in container.demux(stream) if packet.size]
-            stated, end_s = stream.frames or len(packets), 0.0
-            if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states only its duration
-                end_s = (container.duration or 0) / av.time_base
+            packets = [(p.is_discard, p.pts, p.dts) for p in container.demux(stream) if p.size]
+            timed = not stream.frames and len(container.streams) == 1  # such as .mkv, which states only its duration
+            count, end_s = stream.frames or len(packets), (container.duration or 0) / av.time_base if timed else 0.0
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
-        times = [(p.pts, p.dts) for p in packets if not p.is_discard]  # a trimmed .mp4 still holds what it does not show
+        times = [own for discarded, *own in packets if not discarded]  # a trimmed .mp4 still holds what it does not show
         counted = any(pts is None for pts, _ in times)  # .avi has only times of decoding (dts), which frames do not carry
         ticks = sorted(pair[counted] for pair in times if pair[counted] is not None)
-        last_s, span_s = (float((ticks[-1] - zero) * base) for zero in (0, ticks[0])) if ticks else (0.0, 0.0)
-        whole = len(packets) == stated and 0 < len(ticks) == len(times)
-        if not whole or (end_s and last_s + 2.5 * span_s / max(len(times) - 1, 1) + 0.2 < end_s):
-            what = f"{len(packets)} frames of {stated} ({end_s:.1f} s)"
-            raise ValueError(f"{path}: the video is cut off: {what}. Copy it again.")
+        whole = len(packets) == count and 0 < len(ticks) == len(times)
+        if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):
+            raise ValueError(f"{path}: the video is cut off: {len(packets)} of {count} frames, {end_s:.1f} s. Copy it again.")
         first = None if counted else next(self._decoded(), None)
         if first and first.pts in ticks:  # nothing before the first key frame can be decoded
             ticks = ticks[ticks.index(first.pts) :]
@@ -129,11 +126,9 @@ class _Film:
         frames, wanted = self._decoded(), set(map(int, wanted))
         for index in range(max(wanted) + 1):
             frame = next(frames, None)
-            if frame is None or (self._ticks and frame.pts != self._ticks[index]):
+            if frame is None or frame.is_corrupt or (self._ticks and frame.pts != self._ticks[index]):
                 what = f"frame {index} of {len(self)} cannot be decoded"
                 raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.")
-            if frame.is_corrupt:
-                raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
             if index in wanted:
                 deep = max(c.bits for c in frame.format.components) == 16
                 # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
@@ -174,7 +169,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
-        increasing(time, str(reel.files[0]), *_STEP_S, "name_unit" if video.times == "names" else "time_unit")
+        increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")
     index = _paired(folder, times)
     start, end_s = times[0][0], np.inf if video.end_s is None else video.end_s
     kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
@@ -186,19 +181,15 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
-    """Frame numbers in each source, with gaps if all steps of the images' numbers are multiples of the usual step.
-
-    Numbers count from the lowest of both cameras if their ranges overlap, else from 0 in each.
-    """
+    """Frame numbers of each source; from 0 in each, or in both if their images share numbers; with gaps if steps are even."""
     numbers = [np.array([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
     steps = np.concatenate([np.diff(own) for own in numbers])
     usual = max(np.median(steps), 1) if steps.size else 1
     if (steps % usual).any() or any(len(own) != len(reel) for own, reel in zip(numbers, reels, strict=True)):
         return [np.arange(len(reel)) for reel in reels]
-    first, ends = [own[0] for own in numbers], [own[-1] for own in numbers]
-    if max(first) <= min(ends) and not np.ptp(first) % usual:
-        first = [min(first)] * len(reels)
-    return [(own - start) // usual for own, start in zip(numbers, first, strict=True)]
+    first, last = zip(*((own[0], own[-1]) for own in numbers), strict=True)
+    together = max(first) <= min(last) and not np.ptp(first) % usual  # then one counter triggers both cameras
+    return [(own - (min(first) if together else own[0])) // usual for own in numbers]
 
 
 def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:

@@ -268,7 +268,7 @@ SPOILT = {
         r"pose\.tsv, line 2: columns px, qx, .* are no quaternion_wxyz: -?[\d.]+, .*\. Check rotation_kind"),
     "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0\. Check rot"),
     "an empty landmark": (edit("log.csv", lambda t: re.sub(r"(?m)^(-?\d.*)(,[^,]*){3}$", r"\1,,,", t)),
-        r"log\.csv: tip_2_x, tip_2_y, tip_2_z are empty in all rows\. Name other columns"),
+        r"log\.csv: no row has a value in tip_2_x, tip_2_y, tip_2_z\. Name other columns"),
     "degrees called radians": (pose(old='gripper_unit = "deg"', new='gripper_unit = "rad"'),
         r"pose\.tsv: the gripper opens to .* gripper_unit"),
     "no tool geometry": (pose(tool=""),
