@@ -3,6 +3,7 @@
 Where a column's name states no unit, the guess is the unit in which the log's time steps and motion are plausible.
 """
 
+import csv
 import re
 from collections import Counter
 from contextlib import suppress
@@ -16,6 +17,7 @@ from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import separator_of, topics_of, uncommented
 from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
+from lib.recordings.recording import SLOW_S
 from lib.recordings.tables import decoded, read_toml
 
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
@@ -32,14 +34,19 @@ def guess_mapping(source: str | Path) -> str:
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
     paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     labels = {n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"} or p.stem.startswith("CollectedData")}
-    tables = {n: p for n, p in paths.items() if p.suffix.lower() in (".csv", ".tsv", ".txt") and n not in labels}
-    robot = _robot(folder, paths, tables)
+    tables, refused = {}, None
+    for name in (n for n, p in paths.items() if p.suffix.lower() in (".csv", ".tsv", ".txt") and n not in labels):
+        try:
+            tables[name] = _table(paths[name])
+        except (ValueError, csv.Error) as error:  # it may be notes in another encoding
+            refused = error
+    robot = _robot(folder, paths, tables, refused)
     estimate = "pose" in robot and bool(labels)
     robot["offset_s"] = 0.0 if estimate else "estimate"
     hinge = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}  # zeros are refused until measured
     to_measure = {"landmarks_mm": {"base": [0.0] * 3}, "hinge": hinge} if "pose" in robot else {}
     guess = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
-    video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
+    video = _video(folder, paths, {name: table for name, table in tables.items() if name != robot["file"]})
     guess |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot}
     guess |= {"tool": {"estimate": True} if estimate else to_measure, "labels": _labels(labels)}
     comments = read_toml(Path(__file__).with_name("comments.toml"))
@@ -54,7 +61,7 @@ def guess_mapping(source: str | Path) -> str:
     return text
 
 
-def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:
+def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> dict:
     films, images = ([n for n, path in paths.items() if path.suffix.lower() in kind] for kind in (VIDEOS, IMAGES))
     if len(films) == 1:
         with av.open(str(paths[films[0]])) as container:
@@ -80,10 +87,9 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     return {"layout": "two", "left": left, "right": right, **times, "exchanged": False}
 
 
-def _frame_times(tables: dict[str, Path], frames: int) -> dict:
+def _frame_times(tables: dict[str, tuple], frames: int) -> dict:
     """The table that has a time for each frame, if there is one."""
-    for name, path in tables.items():
-        dialect, columns = _table(path)
+    for name, (dialect, columns) in tables.items():
         if any(len(cells) == frames and _TIME.search(column) for column, cells in columns.items()):
             return {"times": "table", "table": {"file": name, **dialect, **_time(columns, dialect["decimal"])}}
     return {}
@@ -91,9 +97,11 @@ def _frame_times(tables: dict[str, Path], frames: int) -> dict:
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark of a table, and the cells of each column."""
-    lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()]
-    separator = separator_of(lines[0]) if lines else ","
-    header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
+    lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()] or [","]
+    separator = separator_of(lines[0])
+    if separator == " " and lines[0].count(" ") != lines[-1].count(" "):  # the name of a single column
+        separator = ","
+    header, *rows = ([cell.strip() for cell in cells] for cells in csv.reader(lines, delimiter=separator))
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
     columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}
     return {"separator": separator, "decimal": decimal}, columns
@@ -105,25 +113,26 @@ def _numbers(cells: list[str], decimal: str) -> np.ndarray:
     return np.array([float(cell) if re.fullmatch(r"[-+\d.eE]+", cell) else np.nan for cell in some])
 
 
-def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
-    """The column of the times and their unit, which its name states, or else its steps: rows are 1 ms to 3 s apart."""
+def _time(columns: dict[str, list[str]], decimal: str, longest_s: float = 3.0) -> dict[str, str]:
+    """The column of the times and their unit, which its name states; else the one that makes steps `longest_s` at most."""
     time = next(filter(_TIME.search, columns), next(iter(columns)))
     if any(":" in cell for cell in columns[time][:1]):
         return {"time": time, "time_unit": "hms" if re.match(r"\d\d?:\d\d?:", columns[time][0]) else "iso"}
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}
     step = np.nanmedian(np.diff(_numbers(columns[time][:100], decimal))) if len(columns[time]) > 1 else 0.0
-    return {"time": time, "time_unit": "s" if step < 3 else "ms" if step < 3e3 else "us" if step < 3e6 else "ns"}
+    unit = next((unit for unit, per_s in (("s", 1), ("ms", 1e3), ("us", 1e6)) if step <= longest_s * per_s), "ns")
+    return {"time": time, "time_unit": unit}
 
 
-def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:
+def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refused: Exception | None) -> dict:
     if bags := [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]:
         return _bag(folder, bags[0].rpartition("/")[0] if (folder / bags[0]).with_name("metadata.yaml").exists() else bags[0])
     if not tables:
-        raise FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
-    name = max(tables, key=lambda name: tables[name].stat().st_size)
-    dialect, columns = _table(tables[name])
-    time = _time(columns, dialect["decimal"])
+        raise refused or FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
+    name = max(tables, key=lambda name: paths[name].stat().st_size)
+    dialect, columns = tables[name]
+    time = _time(columns, dialect["decimal"], SLOW_S)
     turn = _rotation(columns, dialect["decimal"])
     groups: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -131,7 +140,7 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
             groups.setdefault(match[1], {})[match[2].lower()] = column
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
-        raise ValueError(f"{tables[name]}: no columns end in x, y and z; it has {list(columns)}. Write the mapping by hand.")
+        raise refused or ValueError(f"{paths[name]}: none of {list(columns)} end in x, y and z. Write the mapping by hand.")
     length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")
     if not length:  # a tool moves by one millimetre to some centimetres
         axes = (_numbers(columns[column], dialect["decimal"]) for column in next(iter(points.values())))

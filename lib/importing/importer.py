@@ -16,13 +16,12 @@ from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.correspondences import LANDMARKS, DataError, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
-from lib.importing.logs import increasing, read_robot, since
+from lib.importing.logs import read_robot, since
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
 from lib.recordings import Annotations, Kinematics, Recording, RecordingWriter
 
-_LOG_STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
 _CLOCK_FRAMES = 60  # number of frames in which the landmarks are detected for the clock offset, if there are no labels
 _EPOCH_S = 1_000_000  # larger times count from a date; as floats they would not resolve 100 ns, so a zero is subtracted
 
@@ -44,7 +43,6 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     spec = read_mapping(mapping)
     stereo = open_stereo(folder, spec.video)
     robot_time, *reported = read_robot(folder, spec)
-    increasing(robot_time, str(folder / spec.robot.file), *_LOG_STEP_S)
     # Subtract the first whole second of times that count from a date, and of times of day unless both tables have such.
     of_day = [table is not None and table.time_unit == "hms" for table in (spec.video.table, spec.robot)]
     starts = [stereo.time[0], robot_time[0]]

@@ -1,7 +1,7 @@
 """Reads tables of other programs (CSV of any dialect, ROS bags) with exact times, and the robot's log in mm and s."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -18,6 +18,7 @@ from lib.recordings.tables import decoded, number, rows_of
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
+_STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
@@ -46,16 +47,16 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float, unit: str = "time_unit") -> None:
+def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], unit: str, places: Sequence[str] = ()) -> None:
     """Raise a ValueError if the times of rows or frames repeat or go back, or if their median step makes `unit` doubtful."""
-    for i, (before, now) in enumerate(pairwise(time), start=2):
+    for i, (before, now) in enumerate(pairwise(time), start=1):
         if now <= before:
-            what = "repeats" if now == before else "goes back"
+            what = f"the time {'repeats' if now == before else 'goes back'} ({before} s, then {now} s)"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
-            raise ValueError(f"{where}: the time {what} at entry {i} ({before} s, then {now} s). {cure}.")
+            raise ValueError(f"{places[i] if places else f'{where}, entry {i + 1}'}: {what}. {cure}.")
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
-    if not shortest_s <= step <= longest_s:
-        what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
+    if not usual_s[0] <= step <= usual_s[1]:
+        what = f"entries are {step:.3g} s apart, {usual_s[0]} to {usual_s[1]} s is plausible"
         raise ValueError(f"{where}: {what}. Check {unit}.")
 
 
@@ -86,12 +87,12 @@ def uncommented(text: str, separator: str = "") -> list[str]:
 
 
 def separator_of(line: str) -> str:
-    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent."""
-    return max("\t;,|", key=line.count)
+    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent; without them, a space."""
+    return max("\t;,|", key=line.count) if re.search(r"[\t;,|]", line) else " "
 
 
-def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
-    """Read exact times and the named columns, (m,) float64 with NaN for empty cells, from a CSV file or a ROS bag."""
+def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:
+    """Read exact times, the named columns (m,) with NaN for empty cells, and each row's place; from a CSV or ROS bag."""
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
@@ -103,15 +104,16 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
             cure = f"Check the names and separator = {table.separator!r}"
             raise ValueError(f"{place}: {what} called {name!r}; it has {header}. {cure}.")
     at = [header.index(name) for name in wanted]
-    time, values = [], []
+    time, values, places = [], [], []
     for place, cells in rows:
+        places.append(place)
         cells = [cells[i].replace(table.decimal, ".") for i in at]
         time.append(exact_seconds(cells[0], table.time_unit, f"{place}, column {table.time}"))
         named = zip(cells[1:], wanted[1:], strict=True)
         values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in named])
     if not time:
         raise ValueError(f"{path}: the table has no row. Export it again.")
-    return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True))
+    return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True)), places
 
 
 @contextmanager
@@ -133,17 +135,18 @@ def topics_of(path: Path) -> dict[str, str]:
         return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
 
 
-def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
+def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:
     """Read columns of a bag.  Columns of other topics are interpolated at the times of the topic that `table.time` names."""
     places = {name: name.partition(":")[::2] for name in (table.time, *names)}  # topic and field
     found: dict[str, list] = {name: [] for name in places}
     stamps: dict[str, list[Decimal]] = {topic: [] for topic, _ in places.values()}
+    on_arrival = places[table.time][1] == "received"  # robot and recorder may have different clocks
     with _bag(path) as reader:
         if missing := sorted(set(stamps) - (there := {c.topic for c in reader.connections})):
             raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
         for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
             message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
-            header = getattr(message, "header", None)
+            header = None if on_arrival else getattr(message, "header", None)
             stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
             for name, (topic, field) in places.items():
                 if topic == c.topic:
@@ -156,7 +159,7 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
         if topic != places[table.time][0]:
             at, known = since(time, time[0]), since(stamps[topic], time[0])
             columns[name] = Kinematics(known, np.tile(columns[name][:, None, None], 3)).at(at)[:, 0, 0]  # NaN in a gap
-    return time, columns
+    return time, columns, [f"{path}, message {i}" for i in range(1, len(time) + 1)]
 
 
 def _field(message: object, field: str, where: str) -> float | Decimal:
@@ -188,7 +191,10 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
     groups = [robot.landmarks[name] for name in mapping.landmarks] if pose is None else [pose.position]
     names = [name for group in groups for name in group]
     names += [] if pose is None else [*pose.rotation, *([pose.gripper] if pose.gripper else [])]
-    time, columns = read_columns(path, robot, dict.fromkeys(names))
+    time, columns, places = read_columns(path, robot, dict.fromkeys(names))
+    increasing(time, str(path), _STEP_S, "time_unit", places)
+    if empty := [name for name in names if np.isnan(columns[name]).all()]:
+        raise ValueError(f"{path}: no row has a value in {', '.join(empty)}. Name other columns, or fewer landmarks.")
     x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
     x = x * _MILLIMETRES[robot.length_unit]
     x[np.isnan(x).any(axis=2)] = np.nan
@@ -202,7 +208,7 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, cm, mm or um.")
     if pose is None:
         return time, x, None, None
-    R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
+    R = turn @ _rotations(places, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
     return time, x, R, _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
 
 
@@ -218,22 +224,25 @@ def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:
     return opening
 
 
-def _rotations(path: Path, pose: Pose, values: np.ndarray) -> np.ndarray:
-    """Rotations (m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty."""
-    kind, known = pose.rotation_kind, np.isfinite(values).all(axis=1)
+def _rotations(places: list[str], pose: Pose, values: np.ndarray) -> np.ndarray:
+    """Rotations (m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty or all of a quaternion is 0."""
+    kind, quaternion = pose.rotation_kind, pose.rotation_kind.startswith("quaternion")
+    known = np.isfinite(values).all(axis=1) & (values.any(axis=1) | (not quaternion))
     v, R = values[known], np.full((len(values), 3, 3), np.nan)
     if kind == "matrix":
         v = v.reshape(-1, 3, 3)
-        valid = np.abs(v @ v.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-2 and (np.linalg.det(v) > 0).all()
+        valid = (np.abs(v @ v.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < 1e-2) & (np.linalg.det(v) > 0)
         made = Rotation.from_matrix
-    elif kind.startswith("quaternion"):
-        valid = (np.abs(np.linalg.norm(v, axis=1) - 1) < 1e-2).all()
+    elif quaternion:
+        valid = np.abs(np.linalg.norm(v, axis=1) - 1) < 1e-2
         made = partial(Rotation.from_quat, scalar_first=kind == "quaternion_wxyz")
     else:
         degrees = kind == "euler_xyz_deg"
-        valid = np.abs(v).max(initial=0) <= (360 if degrees else 2 * np.pi)
+        valid = np.abs(v).max(axis=1) <= (360 if degrees else 2 * np.pi)
         made = partial(Rotation.from_euler, "xyz", degrees=True) if degrees else Rotation.from_rotvec
-    if not valid:
-        raise ValueError(f"{path}: columns {', '.join(pose.rotation)} are no {kind}. Check rotation_kind.")
+    if not valid.all():
+        row = np.flatnonzero(known)[valid.argmin()]
+        what = f"columns {', '.join(pose.rotation)} are no {kind}: {', '.join(f'{value:.6g}' for value in values[row])}"
+        raise ValueError(f"{places[row]}: {what}. Check rotation_kind; leave the cells of an unknown rotation empty.")
     R[known] = made(v).as_matrix()
     return R

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
@@ -86,16 +87,20 @@ class _Film:
         self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
             stream = container.streams.video[0]
-            times = [(p.pts, p.dts) for p in container.demux(stream) if p.size and not p.is_discard]
-            stated, end_s = stream.frames or len(times), 0.0
-            if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states only its duration
-                end_s = (container.duration or 0) / av.time_base
+            packets = [(p.is_discard, p.pts, p.dts) for p in container.demux(stream) if p.size]
+            timed = not stream.frames and len(container.streams) == 1  # such as .mkv, which states only its duration
+            count, end_s = stream.frames or len(packets), (container.duration or 0) / av.time_base if timed else 0.0
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
-        which = int(any(pts is None for pts, _ in times))  # .avi has only times of decoding (dts)
-        self.stamps = [Decimal(t) * base for t in sorted(pair[which] for pair in times if pair[which] is not None)]
-        step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
-        if len(self.stamps) != stated or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
-            raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {stated} ({end_s:.1f} s). Copy it again.")
+        times = [own for discarded, *own in packets if not discarded]  # a trimmed .mp4 still holds what it does not show
+        counted = any(pts is None for pts, _ in times)  # .avi has only times of decoding (dts), which frames do not carry
+        ticks = sorted(pair[counted] for pair in times if pair[counted] is not None)
+        whole = len(packets) == count and 0 < len(ticks) == len(times)
+        if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):
+            raise ValueError(f"{path}: the video is cut off: {len(packets)} of {count} frames, {end_s:.1f} s. Copy it again.")
+        first = None if counted else next(self._decoded(), None)
+        if first and first.pts in ticks:  # nothing before the first key frame can be decoded
+            ticks = ticks[ticks.index(first.pts) :]
+        self.stamps, self._ticks = [tick * base for tick in ticks], [] if counted else ticks
 
     def _open(self) -> av.container.InputContainer:
         try:
@@ -111,22 +116,23 @@ class _Film:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        with self._open() as container:
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        """The frames that the decoder gives, up to one that it cannot decode."""
+        with self._open() as container, suppress(av.error.FFmpegError):
             container.streams.video[0].thread_type = "AUTO"
-            frames, wanted = container.decode(video=0), set(map(int, wanted))
-            for index in range(max(wanted) + 1):
-                try:
-                    frame = next(frames)
-                except (StopIteration, av.error.FFmpegError):
-                    what = f"frame {index} of {len(self)} cannot be decoded"
-                    raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.") from None
-                if frame.is_corrupt:
-                    raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
-                if index in wanted:
-                    deep = max(c.bits for c in frame.format.components) == 16
-                    # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
-                    yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+            yield from container.decode(video=0)
+
+    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
+        frames, wanted = self._decoded(), set(map(int, wanted))
+        for index in range(max(wanted) + 1):
+            frame = next(frames, None)
+            if frame is None or frame.is_corrupt or (self._ticks and frame.pts != self._ticks[index]):
+                what = f"frame {index} of {len(self)} cannot be decoded"
+                raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.")
+            if index in wanted:
+                deep = max(c.bits for c in frame.format.components) == 16
+                # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
+                yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +169,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
-        increasing(time, str(reel.files[0]), *_STEP_S, "name_unit" if video.times == "names" else "time_unit")
+        increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")
     index = _paired(folder, times)
     start, end_s = times[0][0], np.inf if video.end_s is None else video.end_s
     kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
@@ -175,11 +181,15 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
-    """Frame numbers from 0 in each source, with gaps if all steps of the images' numbers are multiples of the usual step."""
-    steps = [np.diff([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
-    usual = max(np.median(np.concatenate(steps)) if any(map(len, steps)) else 1, 1)
-    even = all(len(own) + 1 == len(reel) and not (own % usual).any() for own, reel in zip(steps, reels, strict=True))
-    return [np.cumsum([0, *own // usual]) if even else np.arange(len(reel)) for own, reel in zip(steps, reels, strict=True)]
+    """Frame numbers of each source; from 0 in each, or in both if their images share numbers; with gaps if steps are even."""
+    numbers = [np.array([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
+    steps = np.concatenate([np.diff(own) for own in numbers])
+    usual = max(np.median(steps), 1) if steps.size else 1
+    if (steps % usual).any() or any(len(own) != len(reel) for own, reel in zip(numbers, reels, strict=True)):
+        return [np.arange(len(reel)) for reel in reels]
+    first, last = zip(*((own[0], own[-1]) for own in numbers), strict=True)
+    together = max(first) <= min(last) and not np.ptp(first) % usual  # then one counter triggers both cameras
+    return [(own - (min(first) if together else own[0])) // usual for own in numbers]
 
 
 def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -40,11 +41,11 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
     data = path.read_bytes()  # not cv2.imread: it fails on non-ASCII paths on some systems
     if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
         raise ValueError(f"{path}: the image is corrupt; a block of zeros replaces a part of it. Export it again.")
-    try:
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error:  # more pixels than OpenCV allows
-        image = None
+    image, flags = None, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    with suppress(cv2.error):  # raised for more pixels than OpenCV allows, and for no data
+        image = cv2.imdecode(coded := np.frombuffer(data, np.uint8), flags)
+        if path.suffix.lower() in (".tif", ".tiff") and cv2.imdecodemulti(coded, flags, range=(1, 2))[0]:
+            raise ValueError(f"{path}: a TIFF of several pages, of which only the first would be read. Export single files.")
     if image is None:
         raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
     _check_size(path, (image.shape[1], image.shape[0]), image_size_px)
@@ -139,6 +140,14 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
     return len(paths), lambda index: read_image(paths[index], image_size_px, bit_depth)
 
 
+def video_times(path: Path) -> np.ndarray:
+    """Times (n,) s of a video's frames after the first, by its container."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        ticks = np.sort([p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard])
+        return (ticks - ticks[:1]) * float(stream.time_base)
+
+
 def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
     """Open a video file.  Reading in order decodes each frame once; a jump seeks, or reads all between if the rate varies."""
     capture = cv2.VideoCapture(str(path))
@@ -152,10 +161,8 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
     @cache
     def steady() -> bool:
         """True if the frame rate is constant, which OpenCV assumes when it seeks."""
-        with av.open(str(path)) as container:
-            times = np.sort([packet.pts for packet in container.demux(video=0) if packet.pts is not None])
-        even = np.linspace(times[0], times[-1], len(times))
-        return bool(np.abs(times - even).max() < 0.4 * np.ptp(times) / len(times))
+        times = video_times(path)
+        return bool(np.abs(times - np.linspace(0, times[-1], len(times))).max() < 0.4 * times[-1] / len(times))
 
     def read(index: int) -> np.ndarray:
         nonlocal following

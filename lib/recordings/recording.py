@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from lib.correspondences import LANDMARKS
 from lib.files import toml_entries, write_bytes, write_text
 from lib.recordings.annotations import SIDES, Annotations, read_coco, write_coco
-from lib.recordings.frames import Frames, encoded, open_side
+from lib.recordings.frames import Frames, encoded, open_side, video_times
 from lib.recordings.ground import Ground
 from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
@@ -38,7 +38,7 @@ _ORDER = "time_s must be a number, larger than in the row before"
 _LONGER = 5.0  # if a log is longer than its video by this factor, the times of the frames may be missing
 _COVERED = 0.75  # fewest frames with a position, as a share; with fewer, log and video do not belong together
 _JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgical robot is faster
-_SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
+SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
 class Doubt(NamedTuple):
@@ -172,7 +172,7 @@ class Recording:
             warnings.warn(f"{place}: {doubt.text} {doubt.cure} `python3 -m lib check {place}` says more.", stacklevel=2)
         return made
 
-    @property
+    @cached_property
     def doubts(self) -> list[Doubt]:
         """The reasons why the recording is suspicious, although it can be read."""
         n, frame_s, log_s = len(self), self.frames.time_s + self.offset_s, self.kinematics.time_s
@@ -184,10 +184,15 @@ class Recording:
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
+        videos = [] if (self.folder / "frames.csv").exists() else self.folder.glob("*.mp4")
+        stated = [video_times(path) for path in videos if path.stem in SIDES]
+        late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
         longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
-            (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
+            (usual_s > SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in seconds? Log ten samples a second or more."),
+            (late_s > 0.5 / self.fps, "video_times", f"The videos' times are {late_s:.2f} s off those of fps = {self.fps:g}.",
+             "Set fps to the videos' rate, or if it varies, write the times of their frames to frames.csv (frame, time_s)."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
             (reported / n < _COVERED, "little_overlap",
@@ -202,8 +207,7 @@ class Recording:
     @property
     def mistimed(self) -> str:
         """Doubts about times, with their cures, or "".  If no calibration is found, correct these first."""
-        of_time = [doubt for doubt in self.doubts if doubt.name in ("slow_log", "frame_times", "little_overlap")]
-        return " ".join(f"{doubt.text} {doubt.cure}" for doubt in of_time)
+        return " ".join(f"{doubt.text} {doubt.cure}" for doubt in self.doubts if doubt.name != "jump")  # that is in space
 
     def frames_of(self, text: str) -> range:
         """The frames of --frames "A:B": from A to before B, negative numbers from the end; a ValueError if there are none."""

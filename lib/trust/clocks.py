@@ -95,7 +95,8 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
         yield case.found("frame_order", fit, 4, (0.0, 0.0, ""), text, cure, on=problem)
     elif abs(value) >= max(5.0 * sd, 1e-3):
         text = f"In one second of the video's time {1 + value:.4f} +- {sd:.4f} s of the robot's time pass."
-        cure = f"Multiply fps in recording.toml by {1 / (1 + value):.4f}, or write the frames' true times to frames.csv."
+        what, factor = ("time_s in frames.csv", 1 + value) if case.own_times else ("fps in recording.toml", 1 / (1 + value))
+        cure = f"Multiply {what} by {factor:.4f}, or write the frames' true times to frames.csv."
         shift -= value * np.median(case.problem.time)
         if abs(shift) > 5.0 * np.hypot(shift_sd, sd * np.median(case.problem.time)):
             cure += f" Add {shift:.4f} to offset_s as well."

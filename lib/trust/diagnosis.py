@@ -357,14 +357,14 @@ class Diagnosis:
 def stated(recording: Recording) -> dict[str, object]:
     """What a recording states about clock, shutter, images and robot: keyword arguments of `diagnose`."""
     names = ("kinematics", "offset_s", "readout_s", "image_size_px", "robot_accuracy_mm")
-    return {name: getattr(recording, name) for name in names}
+    return {name: getattr(recording, name) for name in names} | {"own_times": (recording.folder / "frames.csv").exists()}
 
 
 @single_threaded_blas()
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
     image_size_px: tuple[int, int] | None = None, near: bool = False, offsets: LandmarkOffsets | None = None,
-    robot_accuracy_mm: float = 0.010,
+    robot_accuracy_mm: float = 0.010, own_times: bool = False,
 ) -> Diagnosis:  # fmt: skip
     """Fit every hypothesis about what could be wrong, and rank them.
 
@@ -376,6 +376,7 @@ def diagnose(
             read-out time nor the lenses are tested.
         near: The calibrated cameras have a finite working distance, which is then no fault.
         offsets: The calibrated offsets of the landmarks.  They turn the tool's axes where the jaws are nearly shut.
+        own_times: The recording states the times of its frames in frames.csv, so that its fps has no effect.
 
     >>> from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
     >>> rng = np.random.default_rng(0)
@@ -401,7 +402,7 @@ def diagnose(
     if moved_px < _STILL_PX and moved_mm > _STILL_MM:
         text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver; record again."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    log = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm
+    log = kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm, own_times
     whole = case = Case(problem, *log)
     # While a tool rests, its detections repeat one error, which could pass for a fault that begins or ends there.
     x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)

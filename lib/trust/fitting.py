@@ -317,15 +317,15 @@ class Case:
 
     `paths` are the landmarks' trajectories by the robot's log, or by the rows if frames follow each other closely, or None.
     `log` (m, k, 3) mm are the positions in the robot's log, or in the rows.  `size` is (width, height) px or None, `frames`
-    the number of frames.  A robot that errs by more than `robot_mm` is at fault.
+    the number of frames; `own_times` if frames.csv states theirs.  A robot that errs by more than `robot_mm` is at fault.
     """
 
     def __init__(
         self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float,
-        size: tuple[int, int] | None, robot_accuracy_mm: float,
+        size: tuple[int, int] | None, robot_accuracy_mm: float, own_times: bool,
     ) -> None:  # fmt: skip
         self.problem, self.kinematics, self.readout_s, self.size = problem, kinematics, readout_s, size
-        self.robot_mm = max(_LEAST_ROBOT_MM, _TIMES * robot_accuracy_mm)
+        self.robot_mm, self.own_times = max(_LEAST_ROBOT_MM, _TIMES * robot_accuracy_mm), own_times
         self.null, self.fits = problem.fit(), {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s, self.at_s = None, offset_s, problem.time + offset_s

@@ -75,11 +75,13 @@ def posed(source: Shipped) -> tuple[list[RigidTransform], np.ndarray, np.ndarray
     return poses, opening, JAWS.positions_mm(poses, opening)
 
 
-def video(path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p") -> None:
-    """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w)."""
+def video(
+    path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p", gop: int = 12
+) -> None:
+    """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w), with a key frame in each `gop` frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
-        stream.height, stream.width, stream.pix_fmt = *images.shape[1:3], pix_fmt
+        stream.height, stream.width, stream.pix_fmt, stream.gop_size = *images.shape[1:3], pix_fmt, gop
         stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
         stream.options = {"crf": "15", "preset": "ultrafast"} if codec == "libx264" else {}
         for image, time in zip(images, time_s, strict=True):
@@ -87,6 +89,17 @@ def video(path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx
             frame.pts, frame.time_base = round(time * 90000), Fraction(1, 90000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def cut(old: Path, new: Path, first: int = 0, zero_s: Fraction = Fraction(0)) -> None:
+    """Copy a video as `ffmpeg -c copy` does: packets from number `first` on, times from `zero_s` on."""
+    with av.open(str(old)) as source, av.open(str(new), "w", format={".ts": "mpegts"}.get(new.suffix)) as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        for packet in [packet for packet in source.demux(stream) if packet.dts is not None][first:]:
+            packet.pts, packet.dts = (round(t - zero_s / stream.time_base) for t in (packet.pts, packet.dts))
+            packet.stream = copy
+            target.mux(packet)
 
 
 def side_by_side(folder: Path, source: Shipped) -> str:
@@ -145,8 +158,8 @@ def robot_poses(folder: Path, source: Shipped) -> str:
     return POSES
 
 
-def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
-    """A ROS bag with one topic of points a landmark, in metres, stamped on the video's clock after a date."""
+def robot_bag(folder: Path, source: Shipped, version: int = 2, ahead_s: float = 0.0) -> str:
+    """A ROS bag with one topic of points a landmark, in metres, on the video's clock after a date; stamps are `ahead_s`."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -157,7 +170,8 @@ def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
     with Writer2(folder / "bag", version=9) if version == 2 else Writer1(folder / "log.bag") as writer:
         topics = [writer.add_connection(f"/{name}", stamped.__msgtype__, typestore=store) for name in LANDMARKS]
         for time, x in zip(source.robot_s, source.x_mm, strict=True):
-            ns = 1_700_000_000_000_000_000 + round(1e9 * time)
+            received_ns = 1_700_000_000_000_000_000 + round(1e9 * time)
+            ns = received_ns + round(1e9 * ahead_s)
             sequence = {} if version == 2 else {"seq": 0}
             for topic, mm in zip(topics, x, strict=True):
                 if np.isnan(mm).any():  # this topic is silent
@@ -165,7 +179,7 @@ def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
                 stamp = header(stamp=at(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="robot", **sequence)
                 message = stamped(header=stamp, point=point(*(float(v) / 1e3 for v in mm)))
                 data = store.serialize_cdr if version == 2 else store.serialize_ros1
-                writer.write(topic, ns, data(message, stamped.__msgtype__))
+                writer.write(topic, received_ns, data(message, stamped.__msgtype__))
     points = ", ".join(f'{n} = ["/{n}:point.x", "/{n}:point.y", "/{n}:point.z"]' for n in LANDMARKS)
     file = "bag" if version == 2 else "log.bag"
     return (

@@ -4,6 +4,7 @@ import hashlib
 import json
 import tomllib
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -105,6 +106,16 @@ def test_a_topic_that_drops_out_leaves_its_landmark_blank(shipped, tmp_path):
     assert blank[silent][2:-2, 1].all() and not blank[:, [0, 2]].any() and blank[~silent, 1].sum() <= 2
 
 
+def test_times_of_arrival_hold_for_all_topics_of_a_bag(shipped, tmp_path):
+    """The robot's clock, which stamps the messages, is 0.2 s ahead of the recorder's."""
+    few = thinned(shipped, 20)
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, lambda *args: foreign.robot_bag(*args, ahead_s=0.2))
+    mapping.write_text(mapping.read_text("utf-8").replace("/base:header.stamp", "/base:received"), "utf-8")
+    time, x_mm, *_ = logs.read_robot(folder, read_mapping(mapping))
+    np.testing.assert_allclose(logs.since(time, time[0]), few.robot_s - few.robot_s[0], atol=1e-8)
+    np.testing.assert_allclose(x_mm, few.x_mm, atol=1e-3)
+
+
 def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
     few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
@@ -131,6 +142,47 @@ def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipp
     assert any("frame rate varies" in line for line in report["did"])
 
 
+def brightnesses(count: int) -> np.ndarray:
+    """Frames (count, 48, 128, 3) of both views, each brighter than the one before by 8."""
+    return np.repeat(8 * np.arange(count, dtype=np.uint8) + 10, 48 * 128 * 3).reshape(count, 48, 128, 3)
+
+
+def shown_numbers(folder: Path) -> list[tuple[int, int]]:
+    """For each frame of a recording of `brightnesses` at 25 fps: the number of the picture, and that of its time."""
+    return [(round((frame.left.mean() - 10) / 8), round(25 * frame.time_s)) for frame in Recording.open(folder).frames]
+
+
+def test_a_trimmed_video_gives_the_frames_that_it_shows(shipped, tmp_path):
+    """`ffmpeg -ss 0.2 -i whole.mp4 -c copy stereo.mp4` copies frames from the key frame before, which nobody shall see."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    foreign.video(tmp_path / "whole.mp4", brightnesses(20), np.arange(20) / 25)
+    foreign.cut(tmp_path / "whole.mp4", folder / "stereo.mp4", zero_s=Fraction(1, 5))
+    video = '[video]\nlayout = "side_by_side"\nfile = "stereo.mp4"\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    assert shown_numbers(tmp_path / "eye") == [(5 + i, i) for i in range(15)]
+
+
+@pytest.mark.parametrize("name", ["stereo.ts", "stereo.mkv", "stereo.avi"])
+def test_frames_keep_their_times_in_a_video_that_was_cut_between_key_frames(name, shipped, tmp_path):
+    """The decoder drops what stands before the first key frame, number 10; an .avi gives no times to match."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    if name == "stereo.avi":
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*"XVID"), 25, (128, 48))
+        for image in brightnesses(24):
+            writer.write(image)
+        writer.release()
+    else:
+        foreign.video(tmp_path / "whole.mp4", brightnesses(24), np.arange(24) / 25, gop=10)
+        foreign.cut(tmp_path / "whole.mp4", folder / name, first=4)
+    video = f'[video]\nlayout = "side_by_side"\nfile = "{name}"\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    shown = shown_numbers(tmp_path / "eye")
+    late = 0 if name == "stereo.avi" else 10
+    assert shown == [(i, i) for i in range(late, 24)]
+
+
 def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     """Numbers count frames: later pairs neither move in time nor get another's image."""
     folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
@@ -144,6 +196,23 @@ def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     assert (25 * frames.time_s).round().tolist() == [0, 1, 2, 4, 6, 7]
     assert all(abs(image.mean() - 20 * 25 * f.time_s) < 3 for f in frames for image in (f.left, f.right))
     assert any("1 frames without a partner" in line for line in report["did"])
+
+
+@pytest.mark.parametrize(("first", "numbers"), [(3, range(3, 10)), (101, range(7))])
+def test_images_of_a_trigger_counter_pair_by_number_where_one_camera_starts_later(first, numbers, shipped, tmp_path):
+    """Where no number is in both cameras, the first images are taken for one instant, and `did` says so."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for name, start, shown in (("left", 0, range(10)), ("right", first, numbers)):
+        for i, brightness in enumerate(shown):
+            cv2.imwrite(str(folder / f"{name}_{start + i:04d}.png"), np.full((8, 8), 20 * brightness, np.uint8))
+    video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    frames = Recording.open(tmp_path / "eye").frames
+    assert (25 * frames.time_s).round().tolist() == list(numbers)
+    assert all(abs(image.mean() - 20 * 25 * f.time_s) < 3 for f in frames for image in (f.left, f.right))
+    said = [line for line in report["did"] if "left 0 and right 101 are taken for one instant. If they are not, re" in line]
+    assert len(said) == (first == 101)
 
 
 def test_names_of_decimal_seconds_order_and_date_the_frames(shipped, tmp_path):
@@ -236,6 +305,21 @@ def test_a_quaternion_of_any_name_is_no_point(shipped, tmp_path):
     assert pose["rotation"] == [f"pose.ori_{axis}" for axis in "xyzw"] and pose["position"] == ["px", "py", "pz"]
 
 
+def test_a_quaternion_of_zeros_is_a_gap(shipped, tmp_path):
+    """So robots report a rotation that they do not know."""
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_poses, lambda *_: HINGE)
+    log = folder / "pose.tsv"
+    header, *rows = log.read_text().splitlines()
+    cells = [row.split("\t") for row in rows]
+    rows[:5] = ["\t".join([*row[:4], "0", "0", "0", "0", row[8]]) for row in cells[:5]]
+    log.write_text("\n".join([header, *rows]))
+    did = import_recording(folder, mapping, tmp_path / "eye")["did"]
+    assert any("; 5 have gaps (an empty cell, or a quaternion of zeros)." in line for line in did)
+    found = Recording.open(tmp_path / "eye").kinematics.x_mm
+    assert np.isnan(found[:5]).all() and np.isfinite(found[5:]).all()
+
+
 @pytest.mark.parametrize(("ends", "kind"), [
     (["q0", "q1", "q2", "q3"], "quaternion_wxyz"),
     ([f"rot[{i}][{j}]" for i in range(3) for j in range(3)], "matrix"),
@@ -293,7 +377,7 @@ def test_a_local_time_zone_is_named(late_s, told, shipped, tmp_path):
 
 
 def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped, tmp_path):
-    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    few = replace(thinned(shipped, 10), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, path = source_of(tmp_path, few, foreign.side_by_side)
     numbers = np.column_stack([1e3 * few.robot_s, few.x_mm.reshape(len(few.x_mm), 9) / 1e3])
     rows = [";".join(f"{value:.7f}" for value in row) for row in numbers]
@@ -313,6 +397,30 @@ def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped
     path.write_text(guess_mapping(folder), "utf-8")
     told = read_mapping(path)
     assert (told.tool.estimate, told.robot.offset_s) == (True, 0.0)
+
+
+def test_the_guess_reads_integer_milliseconds_quotes_spaces_and_skips_notes(shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side)
+    (folder / "notes.txt").write_bytes("Prüfung\n".encode("cp1252") * 9999)
+    columns = [f"{name}_{axis}" for name in LANDMARKS for axis in "xyz"]
+    values = np.column_stack([np.arange(len(few.robot_s)), few.x_mm.reshape(-1, 9)])
+    np.savetxt(folder / "log.csv", values, ["%d"] + ["%.6f"] * 9, header=" ".join(["time", *columns]))
+    (folder / "frames.txt").write_text("time [ms]\n" + "\n".join(f"{1e3 * t:.2f}" for t in few.time_s), "utf-8")
+    path.write_text(guess_mapping(folder), "utf-8")
+    told = read_mapping(path)
+    assert (told.robot.separator, told.robot.time_unit, told.video.table.file) == (" ", "ms", "frames.txt")
+    time, x_mm, *_ = logs.read_robot(folder, told)
+    assert float(time[7]) == 0.007
+    np.testing.assert_allclose(x_mm, few.x_mm, atol=1e-6)
+    quoted = ",".join(f'"{column}"' for column in ["time", *columns])
+    np.savetxt(folder / "log.csv", values, "%.6f", ",", header=quoted, comments="")
+    path.write_text(guess_mapping(folder), "utf-8")
+    np.testing.assert_allclose(logs.read_robot(folder, read_mapping(path))[1], few.x_mm, atol=1e-6)
+    (folder / "log.csv").write_bytes((folder / "log.csv").read_bytes() + b"\xb5")  # now the log may be what cannot be read
+    (folder / "notes.txt").unlink()
+    with pytest.raises(ValueError, match=r"log\.csv, line \d+: the text is not UTF-8"):
+        guess_mapping(folder)
 
 
 @pytest.mark.parametrize("column", ["{name}_{axis}_cm", "{name} {axis} [cm]", "{name}.{axis}(CM)"])

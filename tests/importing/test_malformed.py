@@ -71,12 +71,7 @@ def line(number: int, change):
 
 def cut(folder: Path, text: str) -> str:
     """A Matroska file states its length at the start; a bad copy lacks its end."""
-    with av.open(str(folder / "stereo.mp4")) as old, av.open(str(folder / "cut.mkv"), "w") as new:
-        stream = new.add_stream_from_template(old.streams.video[0])
-        for packet in old.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                new.mux(packet)
+    foreign.cut(folder / "stereo.mp4", folder / "cut.mkv")
     data = (folder / "cut.mkv").read_bytes()
     (folder / "cut.mkv").write_bytes(data[: len(data) // 2])
     return text.replace("stereo.mp4", "cut.mkv")
@@ -181,6 +176,14 @@ def shut(folder: Path, text: str) -> str:
     return pose(tool="[tool]\nestimate = true\n")(folder, text)
 
 
+def wrong_rotation(folder: Path, text: str) -> str:
+    lines = (folder / "pose.tsv").read_text().splitlines()
+    cells = lines[7].split("\t")
+    lines[7] = "\t".join([*cells[:4], "2", "0", "0", "0", cells[8]])
+    (folder / "pose.tsv").write_text("\n".join(lines))
+    return pose()(folder, text)
+
+
 def bytes_of(name: str, data: bytes):
     def apply(folder: Path, text: str) -> str:
         (folder / name).write_bytes(data)
@@ -212,8 +215,8 @@ SPOILT = {
     "infinity": (line(7, lambda row, _: row.rsplit(",", 1)[0] + ",inf"), r"log\.csv, line 8.*not a finite number"),
     "decimal commas": (line(7, lambda row, _: row.replace(".", ",")), r"log\.csv, line 8: 20 cells.*decimal"),
     "no time": (line(7, lambda row, _: "," + row.split(",", 1)[1]), r"log\.csv, line 8, column time_s: '' is not a time"),
-    "decreasing times": (line(7, lambda row, lines: lines[2]), r"log\.csv: the time goes back at entry 7.*Sort"),
-    "repeated times": (line(7, lambda row, lines: lines[6]), r"log\.csv: the time repeats at entry 7.*drop"),
+    "decreasing times": (line(7, lambda row, lines: lines[2]), r"log\.csv, line 8: the time goes back \(.*Sort"),
+    "repeated times": (line(7, lambda row, lines: lines[6]), r"log\.csv, line 8: the time repeats \(.*drop"),
     "empty log": (edit("log.csv", lambda t: t.splitlines()[0] + "\n"), r"log\.csv: the table has no row"),
     "not UTF-8": (bytes_of("log.csv", b"time_s,\xff\n"), r"log\.csv, line 1: the text is not UTF-8"),
     "metres called mm": (edit("log.csv", lambda t: _scaled(t, 1e-3)), r"log\.csv.*length_unit"),
@@ -262,7 +265,10 @@ SPOILT = {
     "a missing key": (told('length_unit = "mm"\n', ""), r"map\.toml: robot\.length_unit: Field required"),
     "not TOML": (told("[robot]", "[robot"), r"map\.toml: not valid TOML"),
     "unfit rotations": (pose(old='"qw", "qx", "qy", "qz"', new='"px", "qx", "qy", "qz"'),
-        r"pose\.tsv: columns px.* are no quaternion"),
+        r"pose\.tsv, line 2: columns px, qx, .* are no quaternion_wxyz: -?[\d.]+, .*\. Check rotation_kind"),
+    "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0\. Check rot"),
+    "an empty landmark": (edit("log.csv", lambda t: re.sub(r"(?m)^(-?\d.*)(,[^,]*){3}$", r"\1,,,", t)),
+        r"log\.csv: no row has a value in tip_2_x, tip_2_y, tip_2_z\. Name other columns"),
     "degrees called radians": (pose(old='gripper_unit = "deg"', new='gripper_unit = "rad"'),
         r"pose\.tsv: the gripper opens to .* gripper_unit"),
     "no tool geometry": (pose(tool=""),

@@ -521,7 +521,9 @@ def test_videos(tmp_path):
         for value in level:
             video.write(np.full((SIZE[1], SIZE[0], 3), round(value), np.uint8))
         video.release()
-    read = Recording.open(folder).frames
+    recording = Recording.open(folder)
+    assert "video_times" not in {doubt.name for doubt in recording.doubts}
+    read = recording.frames
     assert len(read) == 20
     for i in [0, 1, 2, 19, 5, 18, 3]:
         assert abs(read[i].left.mean() - level[i]) < 5.5  # the codec rounds; the next level is 11 away
@@ -693,6 +695,35 @@ def test_doubts(frames, times, jump, name):
     recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
     assert [doubt.name for doubt in recording.doubts] == ([name] if name else [])
     assert bool(recording.mistimed) == (name not in (None, "jump"))
+
+
+@pytest.mark.parametrize("times", [np.arange(30) / 50, np.cumsum(np.where(np.arange(30) % 10 == 9, 0.4, 0.04))])
+def test_a_video_whose_times_are_not_those_of_fps_is_in_doubt(times, tmp_path):
+    """Without frames.csv the times in the videos are not read, so that another or a variable rate would be missed."""
+    folder = tmp_path / "video"
+    with RecordingWriter(folder, name="v", fps=25, image_size_px=SIZE) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics(np.arange(-1, 3, 0.01), tool(400))
+    for side in ("left", "right"):
+        shutil.rmtree(folder / side)
+        foreign.video(folder / f"{side}.mp4", np.zeros((30, SIZE[1], SIZE[0], 3), np.uint8), times)
+    late_s = np.abs(times - times[0] - np.arange(30) / 25).max()
+    with pytest.warns(UserWarning, match=rf"The videos' times are {late_s:.2f} s off those of fps = 25\. Set fps to"):
+        recording = Recording.open(folder)
+    assert "video_times" in {doubt.name for doubt in recording.doubts} and "frames.csv" in recording.mistimed
+    table = "".join(f"{i},{time:.6f}\n" for i, time in enumerate(times))
+    (folder / "frames.csv").write_text("frame,time_s\n" + table)
+    assert "video_times" not in {doubt.name for doubt in Recording.open(folder).doubts}
+
+
+def test_a_tiff_of_several_pages_is_refused(tmp_path):
+    one, several = tmp_path / "one.tif", tmp_path / "several.TIFF"
+    pages = np.zeros((3, 8, 8, 3), np.uint16)
+    Image.fromarray(pages[0].astype(np.uint8)).save(one)
+    assert read_image(one).shape == (8, 8, 3)
+    several.write_bytes(cv2.imencodemulti(".tiff", list(pages))[1].tobytes())
+    with pytest.raises(ValueError, match=r"several\.TIFF: a TIFF of several pages, .* Export single files\."):
+        read_image(several)
 
 
 def test_nothing_is_interpolated_in_a_gap():

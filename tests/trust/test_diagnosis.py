@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
-from lib.recordings import Kinematics
+from lib.recordings import Kinematics, Recording
 from lib.simulator import Microscope
 from lib.trust import Hypothesis, diagnose
+from lib.trust.diagnosis import stated
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene, takes
 
 
@@ -261,6 +263,20 @@ def test_a_small_error_of_the_frame_rate_is_named():
     best = found(take(rate=1.02, frames=60)).best
     assert best.name == "clock_rate" and best.value == pytest.approx(1 / 1.02, abs=1e-3)
     assert "In one second of the video's time 0.98" in best.text
+    assert re.search(r"Multiply fps in recording\.toml by 1\.0[12]\d\d, or", best.cure)
+
+
+def test_a_wrong_rate_is_corrected_where_the_times_are_read(tmp_path):
+    """`fps` has no effect in a recording with frames.csv, as `stated` says."""
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "frames.csv").touch()
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    assert [stated(replace(recording, folder=folder))["own_times"] for folder in (own, tmp_path)] == [True, False]
+    scene = take(rate=1.02, frames=60)
+    best = diagnose(scene.data, kinematics=scene.kinematics, offset_s=scene.offset_s, own_times=True).best
+    assert best.name == "clock_rate" and re.match(r"Multiply time_s in frames\.csv by 0\.98\d\d, or", best.cure)
+    assert "fps" not in best.cure
 
 
 @pytest.mark.parametrize("options", [{}, {"robot_mm": 0.015}, {"noise_px": 0.6}])
