@@ -263,6 +263,16 @@ def test_a_small_error_of_the_frame_rate_is_named():
     assert "In one second of the video's time 0.98" in best.text
 
 
+@pytest.mark.parametrize("ppm", [0, 50, 200])
+def test_a_slow_drift_of_the_clock_is_named_in_a_long_recording(ppm):
+    best = found(take(rate=1.0 + 1e-6 * ppm, frames=60, fps=0.05)).best
+    if not ppm:
+        assert best is None
+    else:
+        assert best.name == "clock_rate" and best.value == pytest.approx(1.0 - 1e-6 * ppm, abs=1e-6)
+        assert f"time 0.999{1000 - ppm} +- " in best.text and f"fps in recording.toml by 1.000{ppm:03}" in best.cure
+
+
 @pytest.mark.parametrize("options", [{}, {"robot_mm": 0.015}, {"noise_px": 0.6}])
 def test_jaws_of_a_constant_opening_accuse_nobody(options):
     assert found(take(seed=1, frames=90, opening_mm=(1.0, 1.0001), **options)).best is None
