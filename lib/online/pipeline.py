@@ -121,8 +121,10 @@ class OnlinePipeline:
         if bad_report and kinematics is not None:
             result.failures["robot"] = bad_report
         data, seen = result.landmarks, not bad_images and bool(result.landmarks.seen.all(axis=1).any())
-        for name, fresh in (("landmarks", seen), ("robot", not bad_images and np.isfinite(x_mm).any())):
-            self._rests_on[name] = time_s if fresh else self._rests_on[name]
+        if seen:
+            self._rests_on["landmarks"] = time_s
+        if not bad_images and np.isfinite(x_mm).any():
+            self._rests_on["robot"] = self._checks.changed_s
         before, calibration = tracker.rig, tracker.calibration
         if seen and not bad_report and data.is_complete.any():
             tracker.take(result, frame, self._checks.scene)
@@ -163,7 +165,7 @@ class OnlinePipeline:
         if bad_images:
             state, cause = "blind", bad_images
         elif measures and not seen and (bad_report or state == "robot"):
-            state, cause = "blind", "neither landmarks nor report"
+            state, cause = "blind", f"no landmarks; {bad_report or cause}"
         elif measures and not seen:
             state, cause = "unseen", "no landmarks"
         elif measures and bad_report:

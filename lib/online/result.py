@@ -24,7 +24,7 @@ STATES = {
     "tracking": "images, robot and rig agree; distances from all three",
     "unseen": "the eye is in view, but the landmarks are not; distances from the robot's report, with a growing sd, until a "
     "new surface shows that eye or cameras moved",
-    "blind": "an image is black, corrupt, or repeats the one before; no distances",
+    "blind": "an image is black, corrupt, or repeats the one before, or neither images nor robot show the tool; no distances",
     "robot": "the robot's report is missing, frozen or late, or the tool slipped; distances from the images",
     "moved": "images and robot disagree and nothing lasting explains it, or a camera's images are late; no distances",
 }
@@ -93,7 +93,8 @@ class FrameResult:
         approach_mm_s: (3,) speed at which the robot moves each landmark towards the surface, along the view; NaN if the robot
             has been silent for half a second.
         too_close, margin_mm: (3,) the alarm, raised below `Settings.alarm_mm` + margin_mm, and this margin.
-        rests_on: Time in s of the newest frame used for each of "landmarks", "robot", "rig" and "surface"; NaN = none.
+        rests_on: Time in s of the newest frame used for each of "landmarks", "robot", "rig" and "surface"; NaN = none.  For
+            the robot, that of the frame in which its report last changed.
         drift: Statistic of the drift monitor, in units of its alarm threshold.
         motion: The registration that was made in this frame, or None.
         dropped: Number of surfaces so far that were requested and dropped, because a newer frame came first.

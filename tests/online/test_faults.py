@@ -55,6 +55,32 @@ def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(c
     assert "frozen while the tool moves" in checks.robot(Correspondences.of_points(x, u + 20, u + 20, **how))
 
 
+def test_a_report_that_came_while_nothing_was_seen_is_compared_with_what_is_seen_first():
+    x, u = np.eye(3), np.arange(6.0).reshape(3, 2)
+    how = {"frame": np.zeros(3, int), "landmark": np.arange(3)}
+    checks = FrameChecks()
+    assert [checks.robot(Correspondences.of_points(x, v, v, **how)) for v in (u * np.nan, u)] == ["", ""]
+    assert "frozen while the tool moves" in checks.robot(Correspondences.of_points(x, u + 20, u + 20, **how))
+
+
+def test_a_report_that_repeats_while_the_tool_is_unseen_gives_no_distances():
+    world = World(11, NOISE_PX, still=True)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
+    told = world.advance()
+    rests = [pipeline.step(*world.images, told) for _ in range(60)]
+    assert {r.state for r in rests} == {"tracking"} and all(measured(rests))  # the images show that the tool rests
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
+    results = []
+    for _ in range(50):
+        world.x_mm = world.x_mm + 0.04 * VIEW  # it sinks
+        results.append(pipeline.step(*world.images, told))
+    assert [r.state for r in results] == ["unseen"] * 12 + ["blind"] * 38
+    assert not any(measured(results[12:])) and all("the robot's report repeats" in r.cause for r in results[12:])
+    assert {r.rests_on["robot"] for r in results} == {0.0}  # the time of the first frame
+    assert run(pipeline, world, 1)[0].state == "unseen"  # the report changes again
+
+
 def test_one_frozen_eye():
     world, pipeline = calibrated()
     left, _ = world.images
