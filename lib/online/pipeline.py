@@ -156,9 +156,14 @@ class OnlinePipeline:
 
     def _name_state(self, result: FrameResult, bad_images: str, bad_report: str, seen: bool) -> None:
         """Set state and cause of a result, from the images, the robot's report, and the agreement of the two."""
+        doubt = self._tracker.doubt
+        if doubt:
+            result.failures.setdefault("calibrate", doubt)
         if result.state == "moved":  # only this frame stands out
             return
         state, cause = self._tracker.state, self._tracker.cause
+        if state == "tracking" and self._tracker.verdict.is_red:  # more frames refute the calibration in use
+            state = "calibrating"
         if state == "tracking" and self._tracker.is_unsettled(result.index):
             state, cause = "moved", "the cameras seem to move again and again: something else has changed"
         measures = state in ("tracking", "robot")
@@ -170,7 +175,7 @@ class OnlinePipeline:
             state, cause = "unseen", "no landmarks"
         elif measures and bad_report:
             state, cause = "robot", bad_report
-        result.state, result.cause = state, cause
+        result.state, result.cause = state, cause or doubt
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:

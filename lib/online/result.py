@@ -20,7 +20,7 @@ STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", 
 
 #: The meaning of each state, and the source of the distances in it.
 STATES = {
-    "calibrating": "there is no rig yet, or the optics changed; no distances",
+    "calibrating": "there is no rig yet, the optics changed, or a calibration with more frames was refused; no distances",
     "tracking": "images, robot and rig agree; distances from all three",
     "unseen": "the eye is in view, but the landmarks are not; distances from the robot's report, with a growing sd, until a "
     "new surface shows that eye or cameras moved",
@@ -83,7 +83,7 @@ class FrameResult:
 
     Attributes:
         index, time_s: Number of the frame since the start; its time in s, video clock.
-        state, cause: One of `STATES`, and why it is not "tracking", in a few words.
+        state, cause: One of `STATES`, and why it is not "tracking" or the calibration is doubtful, in a few words.
         landmarks, x_tool_mm: The detected landmarks with the robot's report; (3, 3) the triangulated landmarks.
         rig: The rig in use after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.

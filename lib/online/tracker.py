@@ -16,7 +16,7 @@ from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.result import FrameResult, Settings
 from lib.recordings import Scene
 from lib.registration import DriftMonitor, MovedCameras
-from lib.trust import judge
+from lib.trust import Verdict, judge
 
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score above which a single frame is rejected
@@ -41,6 +41,7 @@ class RigTracker:
 
     `rig`, `calibration`, `state` and `cause` are as in `OnlinePipeline` and `FrameResult`, `rests_on_s` is the time of the
     newest frame used for the rig, and `doubted_since` the number of the first frame that disagreed with it, or None.
+    `verdict` judges the newest calibration, even if it was refused and `rig` is an older one.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class RigTracker:
         """Drop the rig: at the start, and when the images show other optics or nothing explains them."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
         self._given = False  # True while a rig that the user gave is in use, which no calibration replaces
+        self.verdict = Verdict()
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # for the calibration; number in the last try, and fit
         self._online: OnlineCalibration | None = None  # improved by each frame after the last calibration
         self._monitor: DriftMonitor | None = None
@@ -93,6 +95,12 @@ class RigTracker:
         since = self.doubted_since
         return self.rig is None or index in self._astray or (since is not None and index >= since)
 
+    @property
+    def doubt(self) -> str:
+        """The level of `verdict` and the names of its reasons, or "" if it is trustworthy."""
+        names = ", ".join(dict.fromkeys(reason.name for reason in self.verdict.reasons))
+        return names and f"the calibration is {self.verdict.level}: {names}"
+
     def is_unsettled(self, index: int) -> bool:
         """True if the newest registration is doubted, because the one before it held only for a short time."""
         return index - self._again < _AGAIN
@@ -102,6 +110,10 @@ class RigTracker:
         if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful and self._is_open(self._past[0]):
             self._open = [self._past[0]]
         self._past.append(frame.data)
+        most = self.settings.calibration_frames[1]
+        if self.verdict.is_red and self.rig is not None and (self._motion is not None or len(self._frames) > most):
+            self._start_again([], self.doubt)
+            self._tried = most  # a fit to few frames has passed by chance
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
             with result.stage("register"):
@@ -138,9 +150,9 @@ class RigTracker:
             return
         self._tried = len(self._frames)
         found, kept = self._agreed(self._frames)
-        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
-        if verdict.is_red or (self.cause and verdict.reasons):  # after a fault even a doubtful calibration is refused
-            raise ValueError("; ".join(reason.text for reason in verdict.reasons))
+        self.verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+        if self.verdict.is_red or (self.cause and self.verdict.reasons):  # after a fault a doubtful one is refused, too
+            raise ValueError("; ".join(reason.text for reason in self.verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
 
@@ -291,7 +303,7 @@ class RigTracker:
             newest = [with_offsets(frame.data, found.offsets) for frame in self._since[-first:]]
             verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
             if not verdict.reasons and self._fits(found.rig, newest):
-                self._frames, self._fitted = kept, len(kept)
+                self._frames, self._fitted, self.verdict = kept, len(kept), verdict
                 return found
         return None
 
