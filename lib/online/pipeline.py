@@ -121,10 +121,8 @@ class OnlinePipeline:
         if bad_report and kinematics is not None:
             result.failures["robot"] = bad_report
         data, seen = result.landmarks, not bad_images and bool(result.landmarks.seen.all(axis=1).any())
-        if seen:
-            self._rests_on["landmarks"] = time_s
-        if not bad_images and np.isfinite(x_mm).any():
-            self._rests_on["robot"] = self._checks.changed_s
+        self._rests_on |= {"landmarks": time_s} if seen else {}
+        self._rests_on |= {"robot": self._checks.changed_s} if not bad_images and np.isfinite(x_mm).any() else {}
         before, calibration = tracker.rig, tracker.calibration
         if seen and not bad_report and data.is_complete.any():
             tracker.take(result, frame, self._checks.scene)
@@ -156,8 +154,7 @@ class OnlinePipeline:
 
     def _name_state(self, result: FrameResult, bad_images: str, bad_report: str, seen: bool) -> None:
         """Set state and cause of a result, from the images, the robot's report, and the agreement of the two."""
-        doubt = self._tracker.doubt
-        if doubt:
+        if doubt := self._tracker.doubt:
             result.failures.setdefault("calibrate", doubt)
         if result.state == "moved":  # only this frame stands out
             return
