@@ -18,6 +18,7 @@ from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
+from lib.trust.fitting import Hypothesis
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -130,7 +131,7 @@ class Verdict:
 def judge(
     data: Correspondences | None, calibration: Calibration | None, *, diagnosis: Diagnosis | None = None,
     health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float = 0.010,
-    error: Exception | None = None, doubts: Sequence[Doubt] = (), epipolar_at_mm: np.ndarray | None = None,
+    error: Exception | None = None, doubts: Sequence[Doubt | Hypothesis] = (), epipolar_at_mm: np.ndarray | None = None,
     shaft: ShaftEnd | None = None,
 ) -> Verdict:  # fmt: skip
     """The verdict on a calibration, from its own numbers and from independent evidence; arguments that are None are skipped.
@@ -141,7 +142,7 @@ def judge(
         epipolar_px: Median epipolar distance of features matched between the two images, independent of the tool.
         epipolar_at_mm: (k, 3) positions of these features by the calibration; None assumes that they are near the tool.
         robot_accuracy_mm: Standard deviation of the robot's position per coordinate, as the manufacturer states it.
-        doubts: The doubts of the recording (`lib.recordings.Recording.doubts`).
+        doubts: The doubts of the recording (`lib.recordings.Recording.doubts`), or faults that are to count as doubts.
         shaft: Where the shaft ends in the aligned images, measured from the detected base.
     """
     found: list[Reason] = []

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.online import Settings
 from lib.online.checks import FrameChecks
@@ -299,6 +300,14 @@ def test_a_calibration_that_more_frames_refute_gives_no_distances_and_is_made_an
     assert all("the calibration is not trustworthy" in r.cause for r in results[40:100])
     assert all(r.state == "tracking" and not r.cause for r in results[-20:])
     assert np.abs(error_mm[-20:]).max() < 0.1
+
+
+def test_mirrored_images_make_the_calibration_doubtful():
+    """The tips are in the robot's order.  Two affine cameras then fit perfectly, but heights have the wrong sign."""
+    world, flip = World(5, NOISE_PX), np.diag([-1.0, 1.0])
+    world.rig = StereoRig(*(AffineCamera(flip @ c.matrix + [[0, 0, 0, 1919], [0, 0, 0, 0]]) for c in (RIG.left, RIG.right)))
+    results = run(make(world, settings=SELDOM), world, 40)
+    assert {r.cause for r in results[9:]} == {"the calibration is doubtful: mirrored_images"}
 
 
 @pytest.mark.parametrize("side", [0, 1])
