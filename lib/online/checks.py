@@ -11,16 +11,18 @@ _REPEATED_PX = 0.3  # detections in an image and its copy differ by less
 _MOVED_PX = 5.0  # the tool has moved if all its landmarks moved farther
 _RESTARTED = 10  # after more frames in order that are older than an earlier one, the clock has been restarted
 _FAR_MM = 300.0  # a larger jump of the robot's report is beyond any tool's reach
+_REPEATS_S = 0.5  # a report that repeats for longer may be frozen; slow robots report a few times per second
 
 
 class FrameChecks:
-    """Compares each frame with the ones before it."""
+    """Compares each frame with the ones before it; `changed_s` is the time at which the robot's report last changed."""
 
     def __init__(self) -> None:
         self.scene = Scene(np.empty((0, 0, 3), np.uint8), np.empty((0, 0, 3), np.uint8))  # of the newest frame
         self._same, self._u = np.zeros(2, dtype=bool), np.full((2, 3, 2), np.nan)
         self._believed: tuple[np.ndarray, np.ndarray] | None = None  # the newest report, and the landmarks when it came
         self._doubted, self._time, self._older = 0, -np.inf, []
+        self.changed_s = self._shown_s = -np.inf  # the latter: when the report changed, or images showed the tool
 
     def images(self, left: object, right: object, time_s: float) -> str:
         """The reason why this pair of images is not usable, or ""; call `landmarks` next."""
@@ -70,6 +72,11 @@ class FrameChecks:
             step = np.linalg.norm(y - before[1], axis=1) / np.sqrt(2.0)
             if same and np.fmin.reduce(step) > _MOVED_PX:
                 return "the robot's report is frozen while the tool moves"
-        if not same:  # a report that stands still is compared with the landmarks at its last change
-            self._believed, self._doubted = (x.copy(), y), 0
-        return ""
+        if not same:
+            self._doubted, self.changed_s = 0, self._time
+        # A report that stands still is compared with the landmarks at its last change, or when they were first seen since.
+        self._believed = x.copy(), np.where(np.isnan(before[1]), y, before[1]) if same else y
+        if not same or data.seen.all(axis=1).any():
+            self._shown_s = self._time
+        frozen = self._time - self._shown_s > _REPEATS_S
+        return "the robot's report repeats, and no image shows whether the tool rests" if frozen else ""

@@ -121,8 +121,8 @@ class OnlinePipeline:
         if bad_report and kinematics is not None:
             result.failures["robot"] = bad_report
         data, seen = result.landmarks, not bad_images and bool(result.landmarks.seen.all(axis=1).any())
-        for name, fresh in (("landmarks", seen), ("robot", not bad_images and np.isfinite(x_mm).any())):
-            self._rests_on[name] = time_s if fresh else self._rests_on[name]
+        self._rests_on |= {"landmarks": time_s} if seen else {}
+        self._rests_on |= {"robot": self._checks.changed_s} if not bad_images and np.isfinite(x_mm).any() else {}
         before, calibration = tracker.rig, tracker.calibration
         if seen and not bad_report and data.is_complete.any():
             tracker.take(result, frame, self._checks.scene)
@@ -154,21 +154,25 @@ class OnlinePipeline:
 
     def _name_state(self, result: FrameResult, bad_images: str, bad_report: str, seen: bool) -> None:
         """Set state and cause of a result, from the images, the robot's report, and the agreement of the two."""
+        if doubt := self._tracker.doubt:
+            result.failures.setdefault("calibrate", doubt)
         if result.state == "moved":  # only this frame stands out
             return
         state, cause = self._tracker.state, self._tracker.cause
+        if state == "tracking" and self._tracker.verdict.is_red:  # more frames refute the calibration in use
+            state = "calibrating"
         if state == "tracking" and self._tracker.is_unsettled(result.index):
             state, cause = "moved", "the cameras seem to move again and again: something else has changed"
         measures = state in ("tracking", "robot")
         if bad_images:
             state, cause = "blind", bad_images
         elif measures and not seen and (bad_report or state == "robot"):
-            state, cause = "blind", "neither landmarks nor report"
+            state, cause = "blind", f"no landmarks; {bad_report or cause}"
         elif measures and not seen:
             state, cause = "unseen", "no landmarks"
         elif measures and bad_report:
             state, cause = "robot", bad_report
-        result.state, result.cause = state, cause
+        result.state, result.cause = state, cause or doubt
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:

@@ -20,11 +20,11 @@ STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", 
 
 #: The meaning of each state, and the source of the distances in it.
 STATES = {
-    "calibrating": "there is no rig yet, or the optics changed; no distances",
+    "calibrating": "there is no rig yet, the optics changed, or a calibration with more frames was refused; no distances",
     "tracking": "images, robot and rig agree; distances from all three",
     "unseen": "the eye is in view, but the landmarks are not; distances from the robot's report, with a growing sd, until a "
     "new surface shows that eye or cameras moved",
-    "blind": "an image is black, corrupt, or repeats the one before; no distances",
+    "blind": "an image is black, corrupt, or repeats the one before, or neither images nor robot show the tool; no distances",
     "robot": "the robot's report is missing, frozen or late, or the tool slipped; distances from the images",
     "moved": "images and robot disagree and nothing lasting explains it, or a camera's images are late; no distances",
 }
@@ -83,7 +83,7 @@ class FrameResult:
 
     Attributes:
         index, time_s: Number of the frame since the start; its time in s, video clock.
-        state, cause: One of `STATES`, and why it is not "tracking", in a few words.
+        state, cause: One of `STATES`, and why it is not "tracking" or the calibration is doubtful, in a few words.
         landmarks, x_tool_mm: The detected landmarks with the robot's report; (3, 3) the triangulated landmarks.
         rig: The rig in use after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
@@ -93,7 +93,7 @@ class FrameResult:
         approach_mm_s: (3,) speed at which the robot moves each landmark towards the surface, along the view; NaN if the robot
             has been silent for half a second.
         too_close, margin_mm: (3,) the alarm, raised below `Settings.alarm_mm` + margin_mm, and this margin.
-        rests_on: Time in s of the newest frame used for each of "landmarks", "robot", "rig" and "surface"; NaN = none.
+        rests_on: Time in s of the newest frame used for "landmarks", "rig", "surface", or that changed "robot"; NaN = none.
         drift: Statistic of the drift monitor, in units of its alarm threshold.
         motion: The registration that was made in this frame, or None.
         dropped: Number of surfaces so far that were requested and dropped, because a newer frame came first.

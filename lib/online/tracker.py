@@ -16,7 +16,8 @@ from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.result import FrameResult, Settings
 from lib.recordings import Scene
 from lib.registration import DriftMonitor, MovedCameras
-from lib.trust import judge
+from lib.trust import LEVELS, Reason, Verdict, judge
+from lib.trust.optics import handedness
 
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score above which a single frame is rejected
@@ -41,6 +42,7 @@ class RigTracker:
 
     `rig`, `calibration`, `state` and `cause` are as in `OnlinePipeline` and `FrameResult`, `rests_on_s` is the time of the
     newest frame used for the rig, and `doubted_since` the number of the first frame that disagreed with it, or None.
+    `verdict` judges the newest calibration, even if it was refused and `rig` is an older one.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class RigTracker:
         """Drop the rig: at the start, and when the images show other optics or nothing explains them."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
         self._given = False  # True while a rig that the user gave is in use, which no calibration replaces
+        self.verdict = Verdict()
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # for the calibration; number in the last try, and fit
         self._online: OnlineCalibration | None = None  # improved by each frame after the last calibration
         self._monitor: DriftMonitor | None = None
@@ -93,6 +96,12 @@ class RigTracker:
         since = self.doubted_since
         return self.rig is None or index in self._astray or (since is not None and index >= since)
 
+    @property
+    def doubt(self) -> str:
+        """The level of `verdict` and the names of its reasons, or "" if it is trustworthy."""
+        names = ", ".join(dict.fromkeys(reason.name for reason in self.verdict.reasons))
+        return names and f"the calibration is {self.verdict.level}: {names}"
+
     def is_unsettled(self, index: int) -> bool:
         """True if the newest registration is doubted, because the one before it held only for a short time."""
         return index - self._again < _AGAIN
@@ -102,6 +111,10 @@ class RigTracker:
         if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful and self._is_open(self._past[0]):
             self._open = [self._past[0]]
         self._past.append(frame.data)
+        most = self.settings.calibration_frames[1]
+        if self.verdict.is_red and self.rig is not None and (self._motion is not None or len(self._frames) > most):
+            self._start_again([], self.doubt)
+            self._tried = most  # a fit to few frames has passed by chance
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
             with result.stage("register"):
@@ -118,13 +131,12 @@ class RigTracker:
         if self._given or self._motion is not None or self._online is not None:  # no new calibration, at most online updates
             return self._online is not None and bool(accepted) and self._motion is None
         self._frames += accepted
-        if self.rig is None:
-            self._tried -= max(0, len(self._frames) - 2 * last)  # the oldest are dropped now
-            self._frames = self._frames[-2 * last :]
+        if self.rig is not None:
+            return len(self._frames) > last or len(self._frames) >= 1.25 * self._fitted
+        self._tried -= max(0, len(self._frames) - 2 * last)  # the oldest are dropped now
+        self._frames = self._frames[-2 * last :]
         n = len(self._frames)
-        if self.rig is None:
-            return n >= first and bool(accepted) and n >= self._tried + (1 if n < 2 * first else 3)
-        return n > last or n >= 1.25 * self._fitted
+        return n >= first and bool(accepted) and n >= self._tried + (1 if n < 2 * first else 3)
 
     def _improve(self, accepted: list[Seen]) -> None:
         """Calibrate with all frames so far, or after the last calibration improve it with the new frames."""
@@ -137,15 +149,22 @@ class RigTracker:
                 self._monitor.follow(self.rig)
             return
         self._tried = len(self._frames)
-        found, kept = self._agreed(self._frames)
-        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
-        if verdict.is_red or (self.cause and verdict.reasons):  # after a fault even a doubtful calibration is refused
-            raise ValueError("; ".join(reason.text for reason in verdict.reasons))
+        found, kept, self.verdict = self._agreed(self._frames)
+        if self.verdict.is_red or (self.cause and self.verdict.reasons):  # after a fault a doubtful one is refused, too
+            raise ValueError("; ".join(reason.text for reason in self.verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
 
-    def _agreed(self, frames: Sequence[Seen]) -> tuple[Calibration, list[Seen]]:
-        """A calibration with all frames, or with the newer or the older half, and the frames that agree with it."""
+    def _judge(self, found: Calibration, frames: Sequence[Seen]) -> Verdict:
+        """The verdict on a calibration; red also for what leaves no residuals, such as mirrored images."""
+        data, axes = Correspondences.join(frame.data for frame in frames), np.delete(np.arange(16), np.s_[3::4])
+        cameras = found.pair.linear.reshape(2, 2, 3), found.covariance[np.ix_(axes, axes)], found.inverse_distance_per_mm
+        faults = (h for h in handedness(*cameras, data.grid("x_mm"), data.frame / self.settings.fps) if h.is_named)
+        mirrored = Verdict(tuple(Reason(h.name, LEVELS[2], h.text, h.cure) for h in faults))
+        return Verdict.join([judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm), mirrored])
+
+    def _agreed(self, frames: Sequence[Seen]) -> tuple[Calibration, list[Seen], Verdict]:
+        """A calibration with all frames, or with the newer or the older half; the frames that agree with it; its verdict."""
         first = self.settings.calibration_frames[0]
         base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
         near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
@@ -161,7 +180,8 @@ class RigTracker:
                 refused = refused or error
                 continue
             used = found.inliers.reshape(len(part), -1).any(axis=1)
-            return found, [frame for frame, fine in zip(part, used, strict=True) if fine]
+            kept = [frame for frame, fine in zip(part, used, strict=True) if fine]
+            return found, kept, self._judge(found, kept)
         raise refused or ValueError("the robot's positions lie too far apart.")
 
     def _watch(self, result: FrameResult, frame: Seen, scene: Scene) -> list[Seen]:
@@ -287,11 +307,10 @@ class RigTracker:
         if self._given or self._motion_before is not None or self._online is not None or self._attempts % first:
             return None
         with suppress(ValueError):
-            found, kept = self._agreed([*self._frames, *self._since])
+            found, kept, verdict = self._agreed([*self._frames, *self._since])
             newest = [with_offsets(frame.data, found.offsets) for frame in self._since[-first:]]
-            verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
             if not verdict.reasons and self._fits(found.rig, newest):
-                self._frames, self._fitted = kept, len(kept)
+                self._frames, self._fitted, self.verdict = kept, len(kept), verdict
                 return found
         return None
 

@@ -14,6 +14,7 @@ _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
 _ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search: most rows, and most trial shifts on each side of 0
 _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras do not fit or the best shift is at the edge
 _WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too
+_LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 
 
@@ -93,10 +94,10 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     if rate < 0:
         text, cure = "The images fit the robot's path run backwards.", "Sort the frames by time."
         yield case.found("frame_order", fit, 4, (0.0, 0.0, ""), text, cure, on=problem)
-    elif abs(value) >= max(5.0 * sd, 1e-3):
-        text = f"In one second of the video's time {1 + value:.4f} +- {sd:.4f} s of the robot's time pass."
+    elif abs(value) >= max(5.0 * sd, _LEAST_DRIFT):
+        text = f"In one second of the video's time {1 + value:.6f} +- {sd:.1g} s of the robot's time pass."
         what, factor = ("time_s in frames.csv", 1 + value) if case.own_times else ("fps in recording.toml", 1 / (1 + value))
-        cure = f"Multiply {what} by {factor:.4f}, or write the frames' true times to frames.csv."
+        cure = f"Multiply {what} by {factor:.6f}, or write the frames' true times to frames.csv."
         shift -= value * np.median(case.problem.time)
         if abs(shift) > 5.0 * np.hypot(shift_sd, sd * np.median(case.problem.time)):
             cure += f" Add {shift:.4f} to offset_s as well."

@@ -34,7 +34,7 @@ _STEADY = "Look for what bends, or changes while you record: shaft, microscope, 
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
     """A perspective, which an affine camera lacks, in addition to the best cause so far."""
     value, sd = fit.nearness
-    if value <= 0:  # `_handedness` interprets that
+    if value <= 0:  # `handedness` interprets that
         return
     text = f"The residuals are curved by a working distance of {1 / value:.0f} mm: "
     text += f"1/distance is {value:.5f} +- {sd:.5f} per mm."
@@ -82,7 +82,7 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
         yield from accused or (_scaled_axis(A, covariance, refuted) if implausible else ())
     if misfit < 2 * FITS:  # cameras that do not fit cannot tell left from right either
         curved = fit.nearness if misfit < _CURVED_FITS else (0.0, np.inf)
-        yield from _handedness(case, A, covariance, curved)
+        yield from handedness(A, covariance, curved, case.by_frame(case.problem.x[:, 0]), case.problem.time)
 
 
 def _of_axes(fit: Robust, sign: float) -> tuple[np.ndarray, np.ndarray]:
@@ -203,21 +203,23 @@ def _side(A: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     return float(side), float(np.sqrt(J @ covariance @ J))
 
 
-def _handedness(
-    case: Case, A: np.ndarray, covariance: np.ndarray, nearness: tuple[float, float]
+def handedness(
+    A: np.ndarray, covariance: np.ndarray, nearness: tuple[float, float], x_mm: np.ndarray, time_s: np.ndarray
 ) -> Iterator[Hypothesis]:  # fmt: skip
     """A left camera on the right, or a mirrored world: exchanged eyes, a mirrored axis, or mirrored images.
+
+    A (2, 2, 3) are the cameras' axes with their `covariance` (12, 12), `nearness` is 1/distance, per mm, with its standard
+    deviation, x_mm (frames, 3, 3) are the landmarks as the robot reports them, and time_s (n,) are the times of their rows.
 
     Farther things look smaller (positive `nearness`) unless the world is mirrored.  If the data do not determine `nearness`,
     the tool's direction decides: a microscope sees the tips below the base, so tips nearer to it mean a mirrored world.
     """
     view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
-    base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
-    tool = tips.mean(axis=1) - base[:, 0]
+    tool = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
     ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # near 0 for a tool across the view
     near, known, (curved, curved_sd) = int((ahead < -_ACROSS).sum()), np.isfinite(ahead).sum(), nearness
     share = (near - int((ahead > _ACROSS).sum())) / max(known, 1)
-    apart_s = np.ptp(case.problem.time) if np.isfinite(case.problem.time).all() else np.inf
+    apart_s = np.ptp(time_s) if np.isfinite(time_s).all() else np.inf
     if abs(curved) > SURE_CURVED * curved_sd:
         mirrored, how = curved < 0, "farther things look larger"
         gain = 0.5 * (curved / curved_sd) ** 2

@@ -11,10 +11,13 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.online import Settings
 from lib.online.checks import FrameChecks
+from lib.online.feeds import row
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.online.world import BLACK, CENTRE_MM, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
 
@@ -53,6 +56,32 @@ def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(c
     checks = FrameChecks()
     assert checks.robot(Correspondences.of_points(x, u, u, **how)) == ""
     assert "frozen while the tool moves" in checks.robot(Correspondences.of_points(x, u + 20, u + 20, **how))
+
+
+def test_a_report_that_came_while_nothing_was_seen_is_compared_with_what_is_seen_first():
+    x, u = np.eye(3), np.arange(6.0).reshape(3, 2)
+    how = {"frame": np.zeros(3, int), "landmark": np.arange(3)}
+    checks = FrameChecks()
+    assert [checks.robot(Correspondences.of_points(x, v, v, **how)) for v in (u * np.nan, u)] == ["", ""]
+    assert "frozen while the tool moves" in checks.robot(Correspondences.of_points(x, u + 20, u + 20, **how))
+
+
+def test_a_report_that_repeats_while_the_tool_is_unseen_gives_no_distances():
+    world = World(11, NOISE_PX, still=True)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
+    told = world.advance()
+    rests = [pipeline.step(*world.images, told) for _ in range(60)]
+    assert {r.state for r in rests} == {"tracking"} and all(measured(rests))  # the images show that the tool rests
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
+    results = []
+    for _ in range(50):
+        world.x_mm = world.x_mm + 0.04 * VIEW  # it sinks
+        results.append(pipeline.step(*world.images, told))
+    assert [r.state for r in results] == ["unseen"] * 12 + ["blind"] * 38
+    assert not any(measured(results[12:])) and all("the robot's report repeats" in r.cause for r in results[12:])
+    assert {r.rests_on["robot"] for r in results} == {0.0}  # the time of the first frame
+    assert run(pipeline, world, 1)[0].state == "unseen"  # the report changes again
 
 
 def test_one_frozen_eye():
@@ -239,6 +268,46 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
     assert pipeline.rig is rig
     after = run(pipeline, world, 30)
     assert all(r.state == "tracking" for r in after[10:])
+
+
+def late_from_the_start(seed: int, late: int, n: int):
+    """Results, and errors of the distances in mm, if the report of a turning tool is late by one frame in `late` frames."""
+    world, t = World(seed), np.arange(n) / 25.0
+    turn = Rotation.from_rotvec(np.sin(np.outer(t, [1.9, 2.6, 1.3]) + seed) * [0.4, 0.3, 0.5]).as_matrix()
+    place = CENTRE_MM + np.sin(np.outer(t, [1.6, 2.3, 3.1]) + seed) * [3.0, 2.0, 1.0]
+    tool = np.array([[0.0, 0.0, 0.0], [4.0, 0.8, 1.0], [4.0, -0.8, 1.0]])
+    world.x_mm = tool @ (turn @ ROBOT_FROM_MICROSCOPE.R).mT + place[:, None]
+    pipeline, told, results, error_mm = make(world, settings=SELDOM), [], [], []
+    for i in range(n):
+        told.append(world.advance())
+        results.append(pipeline.step(*world.images, told[-2] if 0 < i < late else told[-1]))
+        error_mm.append(results[-1].distance_mm - world.true_distance_mm())
+    return results, np.array(error_mm)
+
+
+def test_a_doubtful_calibration_is_no_plain_tracking():
+    results, _ = late_from_the_start(2, 100, 100)
+    doubtful = [r for r in results if "doubtful" in r.cause]
+    assert len(doubtful) > 50 and all(r.state == "tracking" for r in doubtful)
+    assert {r.cause for r in doubtful[-20:]} == {"the calibration is doubtful: residuals"}
+    assert all(r.failures["calibrate"] == r.cause for r in results[-20:])
+    assert row(results[-1])["failures"] == "calibrate: the calibration is doubtful: residuals"
+
+
+def test_a_calibration_that_more_frames_refute_gives_no_distances_and_is_made_anew():
+    results, error_mm = late_from_the_start(7, 100, 230)
+    assert any(measured(results[:40])) and not any(measured(results[40:100]))
+    assert all("the calibration is not trustworthy" in r.cause for r in results[40:100])
+    assert all(r.state == "tracking" and not r.cause for r in results[-20:])
+    assert np.abs(error_mm[-20:]).max() < 0.1
+
+
+def test_mirrored_images_give_no_distances():
+    """The tips are in the robot's order.  Two affine cameras then fit perfectly, but heights have the wrong sign."""
+    world, flip = World(5, NOISE_PX), np.diag([-1.0, 1.0])
+    world.rig = StereoRig(*(AffineCamera(flip @ c.matrix + [[0, 0, 0, 1919], [0, 0, 0, 0]]) for c in (RIG.left, RIG.right)))
+    results = run(make(world, settings=SELDOM), world, 40)
+    assert not any(measured(results)[9:]) and all("mirrored" in r.failures["calibrate"] for r in results[9:])
 
 
 @pytest.mark.parametrize("side", [0, 1])
