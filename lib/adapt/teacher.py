@@ -229,8 +229,9 @@ def teach(
     in_both = np.isfinite(seen.u).all(axis=3).any(axis=2).all(axis=1)
     used = seen.of(np.setdiff1d(seen.frame[in_both] if alone else seen.frame, refused))
     if len(used.frame) < 5:
-        few = f"in {len(used.frame)} of {len(seen.frame)} frames the robot moves"
-        raise RefusalError(f"labels: only {few} and both images are labelled. {LABEL}" if alone else f"log: only {few}.")
+        few = f"in only {len(used.frame)} of {len(seen.frame)} frames the robot moves"
+        few = f"labels: {few} and both images are labelled. {LABEL}" if alone else f"kinematics: {few}; check the log."
+        raise RefusalError(few)
     recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0

@@ -681,7 +681,7 @@ def test_labels_with_exchanged_tips_are_called_so(world, recording, tmp_path):
 def test_labels_of_one_camera_ask_for_the_other(world, recording):
     u = np.full(world.u.shape, np.nan)
     u[::4, 0] = world.u[::4, 0]
-    with pytest.raises(RefusalError, match="only in 0 of 10 frames the robot moves and both images are labelled"):
+    with pytest.raises(RefusalError, match="in only 0 of 10 frames the robot moves and both images are labelled"):
         teach(recording, None, by_hand=Seen.by_hand(u))
 
 
