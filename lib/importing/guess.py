@@ -17,9 +17,9 @@ from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import separator_of, topics_of, uncommented
 from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
-from lib.recordings.recording import SLOW_S
 from lib.recordings.tables import decoded, read_toml
 
+_LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
@@ -132,7 +132,7 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
         raise refused or FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
     name = max(tables, key=lambda name: paths[name].stat().st_size)
     dialect, columns = tables[name]
-    time = _time(columns, dialect["decimal"], SLOW_S)
+    time = _time(columns, dialect["decimal"], _LOG_STEP_S)
     turn = _rotation(columns, dialect["decimal"])
     groups: dict[str, dict[str, str]] = {}
     for column in columns:

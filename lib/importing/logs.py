@@ -87,8 +87,8 @@ def uncommented(text: str, separator: str = "") -> list[str]:
 
 
 def separator_of(line: str) -> str:
-    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent; without them, a space."""
-    return max("\t;,|", key=line.count) if re.search(r"[\t;,|]", line) else " "
+    """The separator of a line: whichever of tab, semicolon, comma and bar is the most frequent; without them, any space."""
+    return " " if " " in line and not re.search(r"[\t;,|]", line) else max("\t;,|", key=line.count)
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:

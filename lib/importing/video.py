@@ -86,13 +86,16 @@ class _Film:
             raise FileNotFoundError(f"{path}: no such video; the mapping names it.")
         self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
-            stream = container.streams.video[0]
+            stream, kinds = container.streams.video[0], container.format.name.split(",")
             packets = [(p.is_discard, p.pts, p.dts) for p in container.demux(stream) if p.size]
             timed = not stream.frames and len(container.streams) == 1  # such as .mkv, which states only its duration
-            count, end_s = stream.frames or len(packets), (container.duration or 0) / av.time_base if timed else 0.0
+            end_s = (container.duration or 0) / av.time_base if timed else 0.0
+            listed = len(stream.index_entries) if "mp4" in kinds else stream.frames  # .mp4 lists less if it is trimmed
+            count = listed if stream.frames else len(packets)
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
         times = [own for discarded, *own in packets if not discarded]  # a trimmed .mp4 still holds what it does not show
-        counted = any(pts is None for pts, _ in times)  # .avi has only times of decoding (dts), which frames do not carry
+        # .avi has only times of decoding (dts), which frames do not carry.
+        counted = "avi" in kinds or any(pts is None for pts, _ in times)
         ticks = sorted(pair[counted] for pair in times if pair[counted] is not None)
         whole = len(packets) == count and 0 < len(ticks) == len(times)
         if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):

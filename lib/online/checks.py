@@ -46,6 +46,8 @@ class FrameChecks:
         self._older = [*self._older, time_s] if time_s <= self._time else []
         if self._older and len(self._older) <= _RESTARTED:
             return "the frame is older than the one before"
+        if time_s <= self._time:  # the clock has been restarted
+            self.changed_s = self._shown_s = time_s
         self._time, self._older = time_s, []
         return ""
 

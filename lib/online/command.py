@@ -82,17 +82,19 @@ def main(argv: list[str] | None = None) -> int:
             recorder = Recorder(a.record, recording, patient=not a.live)
             stack.callback(recorder.close)
         pipeline = stack.enter_context(OnlinePipeline(detector, settings=settings, beside=a.live))
-        tally, page, state = Tally(), Dashboard(), ""
+        tally, page, state, said = Tally(), Dashboard(), "", {}
         for arrival in feed:
             start = arrival.arrived_s if a.live else time.monotonic()
             result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
             tally.add(result, time.monotonic() - start)
             near = "; the cameras have a finite distance" if np.isfinite(result.working_distance_mm) else ""
-            if (now := f"{result.state} {result.cause}".rstrip() + near) != state:
+            if (now := result.state + f": {result.cause}" * bool(result.cause) + near) != state:
                 state = now
                 print(f"frame {result.index:6d} {result.time_s:9.2f} s: {now}")
             for name, why in result.failures.items():
-                print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
+                if why != said.get(name) and why not in result.cause:
+                    print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
+            said = result.failures
             if recorder:
                 recorder.add(arrival, result)
             if show:

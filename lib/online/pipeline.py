@@ -159,7 +159,7 @@ class OnlinePipeline:
         if result.state == "moved":  # only this frame stands out
             return
         state, cause = self._tracker.state, self._tracker.cause
-        if state == "tracking" and self._tracker.verdict.is_red:  # more frames refute the calibration in use
+        if state in ("tracking", "robot") and self._tracker.verdict.is_red:  # more frames refute the calibration in use
             state = "calibrating"
         if state == "tracking" and self._tracker.is_unsettled(result.index):
             state, cause = "moved", "the cameras seem to move again and again: something else has changed"

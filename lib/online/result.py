@@ -93,7 +93,8 @@ class FrameResult:
         approach_mm_s: (3,) speed at which the robot moves each landmark towards the surface, along the view; NaN if the robot
             has been silent for half a second.
         too_close, margin_mm: (3,) the alarm, raised below `Settings.alarm_mm` + margin_mm, and this margin.
-        rests_on: Time in s of the newest frame used for "landmarks", "rig", "surface", or that changed "robot"; NaN = none.
+        rests_on: Time in s of the newest frame used for "landmarks", "rig" and "surface", and of the frame in which the
+            report of the "robot" last changed; NaN = none.
         drift: Statistic of the drift monitor, in units of its alarm threshold.
         motion: The registration that was made in this frame, or None.
         dropped: Number of surfaces so far that were requested and dropped, because a newer frame came first.

@@ -151,7 +151,7 @@ class RigTracker:
         self._tried = len(self._frames)
         found, kept, self.verdict = self._agreed(self._frames)
         if self.verdict.is_red or (self.cause and self.verdict.reasons):  # after a fault a doubtful one is refused, too
-            raise ValueError("; ".join(reason.text for reason in self.verdict.reasons))
+            raise ValueError(" ".join(f"{reason.text} {reason.cure}" for reason in self.verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
 

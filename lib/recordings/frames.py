@@ -144,7 +144,8 @@ def video_times(path: Path) -> np.ndarray:
     """Times (n,) s of a video's frames after the first, by its container."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        ticks = np.sort([p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard])
+        listed = [entry.timestamp for entry in stream.index_entries if not entry.is_discard]  # without reading the images
+        ticks = np.sort(listed or [p.pts for p in container.demux(stream) if p.pts is not None])
         return (ticks - ticks[:1]) * float(stream.time_base)
 
 

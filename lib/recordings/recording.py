@@ -38,7 +38,7 @@ _ORDER = "time_s must be a number, larger than in the row before"
 _LONGER = 5.0  # if a log is longer than its video by this factor, the times of the frames may be missing
 _COVERED = 0.75  # fewest frames with a position, as a share; with fewer, log and video do not belong together
 _JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgical robot is faster
-SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
+_SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
 class Doubt(NamedTuple):
@@ -189,9 +189,9 @@ class Recording:
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
         longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
-            (usual_s > SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
+            (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in seconds? Log ten samples a second or more."),
-            (late_s > 0.5 / self.fps, "video_times", f"The videos' times are {late_s:.2f} s off those of fps = {self.fps:g}.",
+            (late_s > 0.5 / self.fps, "video_times", f"The videos' times are {late_s:.3g} s off those of fps = {self.fps:g}.",
              "Set fps to the videos' rate, or if it varies, write the times of their frames to frames.csv (frame, time_s)."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -161,6 +162,32 @@ def test_a_trimmed_video_gives_the_frames_that_it_shows(shipped, tmp_path):
     mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
     import_recording(folder, mapping, tmp_path / "eye")
     assert shown_numbers(tmp_path / "eye") == [(5 + i, i) for i in range(15)]
+
+
+def test_a_video_trimmed_at_its_end_is_whole(shipped, tmp_path):
+    """Its edit list shows the first half, by duration in the header's units; the reader skips most of the rest."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    foreign.video(folder / "stereo.mp4", brightnesses(30), np.arange(30) / 25, gop=5)
+    data = bytearray((folder / "stereo.mp4").read_bytes())
+    at = data.index(b"elst") + 12
+    data[at : at + 4] = (int.from_bytes(data[at : at + 4]) // 2).to_bytes(4)
+    (folder / "stereo.mp4").write_bytes(data)
+    mapping.write_text(mapping.read_text("utf-8") + '[video]\nlayout = "side_by_side"\nfile = "stereo.mp4"\n', "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    assert 15 <= len(shown_numbers(tmp_path / "eye")) < 22
+
+
+def test_an_avi_whose_frames_are_stored_in_another_order_is_read(shipped, tmp_path):
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    with av.open(str(folder / "stereo.avi"), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"bf": "2", "qp": "1"})
+        stream.height, stream.width, stream.pix_fmt = 48, 128, "yuv420p"
+        for image in brightnesses(24):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
+        container.mux(stream.encode())
+    mapping.write_text(mapping.read_text("utf-8") + '[video]\nlayout = "side_by_side"\nfile = "stereo.avi"\n', "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    assert shown_numbers(tmp_path / "eye") == [(i, i) for i in range(24)]
 
 
 @pytest.mark.parametrize("name", ["stereo.ts", "stereo.mkv", "stereo.avi"])
@@ -406,7 +433,7 @@ def test_the_guess_reads_integer_milliseconds_quotes_spaces_and_skips_notes(ship
     columns = [f"{name}_{axis}" for name in LANDMARKS for axis in "xyz"]
     values = np.column_stack([np.arange(len(few.robot_s)), few.x_mm.reshape(-1, 9)])
     np.savetxt(folder / "log.csv", values, ["%d"] + ["%.6f"] * 9, header=" ".join(["time", *columns]))
-    (folder / "frames.txt").write_text("time [ms]\n" + "\n".join(f"{1e3 * t:.2f}" for t in few.time_s), "utf-8")
+    np.savetxt(folder / "frames.txt", 1e3 * few.time_s, "%.2f", header="time [ms]")
     path.write_text(guess_mapping(folder), "utf-8")
     told = read_mapping(path)
     assert (told.robot.separator, told.robot.time_unit, told.video.table.file) == (" ", "ms", "frames.txt")

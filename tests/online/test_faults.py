@@ -19,7 +19,19 @@ from lib.online import Settings
 from lib.online.checks import FrameChecks
 from lib.online.feeds import row
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from tests.online.world import BLACK, CENTRE_MM, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
+from lib.trust import LEVELS, Reason, Verdict
+from tests.online.world import (
+    BLACK,
+    CENTRE_MM,
+    RIG,
+    SELDOM,
+    World,
+    make,
+    rig_error_mm,
+    run,
+    shifted,
+    started,
+)
 
 NOISE_PX = 0.6
 VIEW = ROBOT_FROM_MICROSCOPE.R[:, 2]
@@ -268,6 +280,24 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
     assert pipeline.rig is rig
     after = run(pipeline, world, 30)
     assert all(r.state == "tracking" for r in after[10:])
+
+
+def test_a_report_that_repeats_is_noticed_after_the_clock_was_restarted():
+    x, nothing, image = np.eye(3), np.full((3, 2), np.nan), np.random.default_rng(0).integers(0, 255, (27, 48, 3), np.uint8)
+    checks, said = FrameChecks(), []
+    for time_s in [1000.0, *np.arange(0.0, 3.0, 0.04)]:
+        checks.images(image, image, time_s)
+        data = Correspondences.of_points(x, nothing, nothing, frame=np.zeros(3, int), landmark=np.arange(3))
+        said.append(checks.robot(data))
+    assert "the robot's report repeats" in said[-1] and checks.changed_s < 1.0
+
+
+def test_a_refuted_calibration_gives_no_distances_when_the_robot_errs_either():
+    world, pipeline, _ = started(40, sigma_px=NOISE_PX)
+    tracker = pipeline._tracker
+    tracker.verdict, tracker.state = Verdict((Reason("residuals", LEVELS[2], "", ""),)), "robot"
+    tracker.take = lambda *_: None
+    assert not any(measured(run(pipeline, world, 1)))
 
 
 def late_from_the_start(seed: int, late: int, n: int):
