@@ -73,7 +73,7 @@ def frame_means(share: np.ndarray) -> np.ndarray:
 
 
 def agreement(teacher: Teacher, seen: Seen, fewest: int = 1) -> Agreement:
-    """The agreement of detections with a teacher; a `RefusalError` if it labels fewer than `fewest` of their frames."""
+    """The agreement of detections with a teacher, in frames that it labels; a `RefusalError` if these are too few."""
     u, covariance, shown = teacher.labels(seen.frame)
     is_labelled = np.isfinite(u).all(axis=-1) & (shown > 0)
     if (n := is_labelled.any(axis=(1, 2)).sum()) < fewest:

@@ -54,8 +54,8 @@ _GUIDED, _SETTLED = 3, 0.01
 _ANGLED = np.cos(np.radians(12.0))  # the jaws are angled if the cosine between shaft and tips is smaller
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
 _UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which it asks for clicks
-#: Largest standard deviation of a landmark's label without labels set by hand, as a share of the tool's length; and if the
-#: detector marks another point than the base, largest distance of the measured end of the shaft from it.
+#: Shares of the tool's length: the largest standard deviation of a landmark that no label set by hand gives, and if the
+#: detector marks another point than the base, the largest distance between the base that was found and the shaft's end.
 _VAGUE, _CONFIRMED = 0.05, 0.03
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
@@ -307,10 +307,10 @@ class _Work:
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         if by_hand is None:  # else the labels tell where the base is
-            self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
             if (sd := sd_share(teacher, learn)).max() > _VAGUE:
                 what = f"{LANDMARKS[sd.argmax()]} only to {100 * sd.max():.0f} % of the tool's length (standard deviation)"
                 raise RefusalError(f"detector: with the robot it gives {what}. {LABEL}")
+            self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
             if not self.knows_base and (self.shaft is None or abs(self.shaft.moved) > _CONFIRMED):
                 what = "it marks another point than the base of these angled jaws, and the base that was searched instead"
                 raise RefusalError(f"detector: {what} is not where the aligned frames show the end of the shaft. {LABEL}")

@@ -184,7 +184,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
-    """Frame numbers of each source; from 0 in each, or in both if their images share numbers; with gaps if steps are even."""
+    """Each source's frame numbers, from 0.  Evenly numbered images keep gaps, also at the start if one counter made both."""
     numbers = [np.array([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
     steps = np.concatenate([np.diff(own) for own in numbers])
     usual = max(np.median(steps), 1) if steps.size else 1

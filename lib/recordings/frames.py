@@ -141,7 +141,7 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
 
 
 def video_times(path: Path) -> np.ndarray:
-    """Times (n,) s of a video's frames after the first, by its container."""
+    """Times (n,) s of a video's frames after the first: those of decoding, which lie as far apart as those of showing."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         listed = [entry.timestamp for entry in stream.index_entries if not entry.is_discard]  # without reading the images
