@@ -131,6 +131,9 @@ class Correspondences:
             what = f"the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows"
             cure = "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)"
             raise NoDetectionError(f"data: {what}; {cure}.")
+        if self.seen.any() and not np.isfinite(self.covariance_px2).any():  # labels set by hand
+            what = f"{left} landmarks are labelled in left images and {right} in right ones"
+            raise NoDetectionError(f"data: {what}, and each camera needs four. Label ten pairs, far apart.")
         raise NoDetectionError(
             f"data: the detector failed on {len(np.unique(self.frame))} frames: of {len(self)} landmarks it found {left} "
             f"in left images and {right} in right ones. Do they show the tool, in colour, sharp, 200 to 400 px "

@@ -51,8 +51,9 @@ class Calibration:
         x_mm, y_px, residuals_px: (n, 3), (n, m) and y - project(x), m = 2 per camera, with the offsets applied.  Residuals
             contain the robot's errors.  NaN in unusable rows: a landmark is missing, or a tool with shut jaws has no axes.
         covariance_px2: The detector's covariances, scaled: None, (1, m, m), or (n, m, m).
-        effective_rows: The number of rows with independent errors that are as informative as the inliers; smaller where a
-            landmark's errors are correlated from frame to frame.  The covariances allow for this and for estimated noise.
+        effective_rows: The number of rows with independent errors that are as informative as the inliers; smaller where
+            errors are correlated, of a landmark from frame to frame or of the landmarks in a frame (a robot that reports a
+            pose errs alike in all of them).  The covariances allow for this and for estimated noise.
         detector_scale: Factor, 1 or more, on the detector's standard deviations; `covariance_px2` includes it.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
@@ -264,7 +265,7 @@ class OnlineCalibration:
 
     The filter starts with the calibration's parameters and Fisher information.  A new row is weighted by its own covariance,
     or by the calibration's noise level if it states none.  The robot's noise is the calibration's.  Views whose innovation
-    is too large for these covariances are not used.
+    is too large for these covariances are not used.  If the calibration has offsets, give rows `with_offsets`.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -278,6 +279,7 @@ class OnlineCalibration:
     """
 
     def __init__(self, calibration: Calibration) -> None:
+        _ = calibration.pair  # a ValueError refuses a single camera
         self._calibration, self._state = calibration, calibration.minimum.state
         self._information = calibration.minimum.information
         self._covariance = self._first = inverse(self._information)

@@ -45,7 +45,7 @@ def calibrate(
 
     Outliers are found in each camera separately, so a landmark that is lost in one image is still used in the other.  Noise
     levels are estimated from the inliers.  The covariances allow for that and, with `Correspondences`, for errors that are
-    correlated from frame to frame (`Calibration.effective_rows`).
+    correlated from frame to frame, or shared by the landmarks of a frame (`Calibration.effective_rows`).
 
     Args:
         data, u: `Correspondences` alone (rows seen in only one image are used, too; their covariances weight the rows if all
@@ -88,7 +88,9 @@ def calibrate(
         x, y, noise = rows.x_mm, rows.stacked_px, None
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
-            noise = noise[usable] if len(noise) > 1 else noise
+            if len(noise) > 1:
+                seen = np.repeat(rows.seen, 2, axis=1)
+                noise = np.where(seen[:, :, None] & seen[:, None], noise[usable], np.eye(4))
         elif weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all():
             noise = pair_covariance(np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)), len(rows))
     else:
@@ -109,9 +111,9 @@ def calibrate(
         found = fitted(x, y)
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
             # Allow for the estimated noise level and for errors correlated in time.
-            _, J, weight, r = found.system
+            J_x, J, weight, r = found.system
             order = () if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
-            known, effective = sandwich(J, weight, r, *order)
+            known, effective = sandwich(J, weight, r, J_x, *order)
             found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, rows.frame, prior_sd=offset_prior_sd)

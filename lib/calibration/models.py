@@ -40,7 +40,7 @@ class Model:
     @classmethod
     def parse(cls, name: str, cameras: int) -> Self:
         """The model called `name`; a ValueError refuses an unknown name and lists the known ones."""
-        base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
+        base, *options = str(name).replace("near_affine", "zero_skew+distance").split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
         if not known or {"distance", "distances"} <= set(options):
             names = f"{', '.join(BASES)} or near_affine, and add +distance or +distances, +radial"

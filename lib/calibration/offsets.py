@@ -275,7 +275,7 @@ def _steps(
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", Unsettled, stacklevel=4)
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
-    full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
+    full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, J_x, frame[rows], landmark[rows], prior)
     blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
     return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
@@ -402,4 +402,4 @@ def further_step(found: Calibration, data: Correspondences, column: np.ndarray) 
     information, gradient = _without_cameras(J, J_c, weight, r)
     step = np.linalg.solve(information + np.diag(prior), gradient - prior * now)[0]
     J, prior = np.concatenate([J, J_c], axis=2), np.diag(np.append(prior, np.zeros(J_c.shape[2])))
-    return float(step), float(np.sqrt(sandwich(J, weight, r, rows.frame, rows.landmark, prior)[0][0, 0]))
+    return float(step), float(np.sqrt(sandwich(J, weight, r, J_x, rows.frame, rows.landmark, prior)[0][0, 0]))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.affine import regress
+from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 
@@ -113,7 +114,8 @@ def tool_offsets(
         opening_rad: (n,) full angle between the jaws; None is a tool without a hinge.
         turning: (k,) not 0 for landmarks on a jaw; None is all but the first.
 
-    A ValueError refuses too few poses, and motion that does not determine the offsets or the hinge.
+    A ValueError refuses too few poses, and motion that does not determine the offsets or the hinge.  Outliers are not
+    removed: look at `rms_px`.
     """
     R, t = _poses(robot_from_tool)
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]
@@ -122,6 +124,12 @@ def tool_offsets(
     y = np.concatenate(images, axis=2)
     k, m = y.shape[1:]
     half = None if opening_rad is None else np.asarray(opening_rad, np.float64) / 2
+    if half is not None and (half.shape != (len(R),) or np.nanmax(np.abs(half), initial=0.0) > np.pi / 2):
+        raise ValueError(f"opening_rad: expected ({len(R)},) angles of at most pi, in radians; got {half.shape}.")
+    if not (found := np.isfinite(y).all(axis=2).any(axis=0)).all():
+        raise ValueError(f"u: landmark {int(np.argmin(found))} is in no frame seen by every camera; leave it out.")
+    if turning is not None and np.shape(turning) != (k,):
+        raise ValueError(f"turning: expected ({k},), one number a landmark, got {np.shape(turning)}.")
     frame, landmark = np.nonzero(np.isfinite(y).all(axis=2) & (True if half is None else np.isfinite(half)[:, None]))
     pixels, R, t = y[frame, landmark], R[frame], t[frame]
     own = (landmark[:, None] == np.arange(k)).astype(np.float64)
@@ -158,7 +166,10 @@ def tool_offsets(
     information = flat.T @ flat
     if np.linalg.cond(information) > 1e13:
         raise ValueError("robot_from_tool: the motion does not determine the offsets; turn the tool about two axes.")
-    covariance = float((r**2).sum()) / max(r.size - 4 * m - 3 * q, 1) * np.linalg.inv(information).reshape(q, 3, q, 3)
+    precision = np.eye(m)[None] * max(r.size - 4 * m - 3 * q, 1) / max(float((r**2).sum()), 1e-20)
+    cameras = np.einsum("nj,ik->nijk", np.column_stack([x, np.ones(len(x))]), np.eye(m)).reshape(len(x), m, -1)
+    both = np.concatenate([J, cameras], axis=2)
+    covariance = sandwich(both, precision, r, matrix[None, :, :3], frame, landmark)[0][: 3 * q, : 3 * q].reshape(q, 3, q, 3)
     # Check the covariance of the landmarks at each opening that occurs: a vector of little effect may have a large one.
     _check_determined(np.einsum("na,aibj,nb->nij", own, covariance, own))
     blocks = covariance[np.arange(k), :, np.arange(k)]

@@ -21,6 +21,7 @@ _STARTS = 12  # number of samples that start the expectation maximisation
 _FEW = 25  # number of a view's rows below which the forward search is used
 _MORE_THAN_CHANCE = 5.0  # difference of log evidence: in clean data a subset agrees better than all rows by up to 4
 _LEAST_SHARE = 0.25  # smallest share of inliers in a view
+_STILL = 0.03  # the inliers' extent in an image, as a share of that of all rows, below which they stand still
 #: The wider Gaussian is the heavy tail of the inliers if it is at most this many times as wide, else it is contamination.
 _CONTRAST = 8.0
 #: Largest noise as a share of the pixels' extent: with outliers that are not clearly separated, and otherwise.
@@ -93,6 +94,9 @@ def _one_camera(
     count, extent = int(found.keep.sum()), float(np.sqrt(np.prod(_extent(u))))
     if count < enough:
         raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
+    if n - count > 0.2 * n and (_extent(u[found.keep]) < _STILL * _extent(u).max()).all():
+        what = f"the {count} of {n} rows that agree stand still in the image, so they show no moving tool"
+        raise NoConsensusError(f"{name}: no consensus, {what}; {cure}.")
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
         what = f"no affine camera agrees: the best one errs by {found.sigma_px:.3g} px in {count} of {n} rows"

@@ -1,8 +1,10 @@
-"""Covariance of estimates whose noise level is estimated and whose errors are correlated between neighbouring frames.
+"""Covariance of estimates whose noise level is estimated and whose errors are correlated, in time or within a frame.
 
 The errors of a landmark are modelled as a first-order autoregression over the frames.  Its correlation follows from the
-residuals (restricted maximum likelihood, averaged over the posterior).  The estimates do not change; their covariance is the
-sandwich H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+residuals (restricted maximum likelihood, averaged over the posterior).  The landmarks of a frame may share an error of the
+robot's position, as they do if it reports a pose; its variance follows from the products of their residuals.  The estimates
+do not change; their covariance is the sandwich H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using
+generalized linear models", 1986).
 """
 
 import numpy as np
@@ -15,14 +17,15 @@ _PRIOR = np.append(0.5, np.full(8, 0.5 / 8))  # prior probability of each: even 
 
 
 def sandwich(
-    J: np.ndarray, weight: np.ndarray, r: np.ndarray, frame: np.ndarray | None = None, landmark: np.ndarray | None = None,
-    prior: np.ndarray | float = 0.0,
+    J: np.ndarray, weight: np.ndarray, r: np.ndarray, J_x: np.ndarray, frame: np.ndarray | None = None,
+    landmark: np.ndarray | None = None, prior: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Covariance (p, p) of estimates from rows of estimated noise level, and the equivalent number of independent rows.
 
     Args:
         J, weight, r: (n, m, p) derivatives, (1 or n, m, m) inverse covariances, (n, m) residuals; zero where not seen.
-        frame, landmark: (n,) of the rows, whose errors may be correlated from frame to frame; None: they are independent.
+        J_x: (1 or n, m, 3) derivatives by the robot's position.
+        frame, landmark: (n,) of the rows, whose errors may be correlated; None: they are independent.
         prior: (p, p) Fisher information of a prior, 0 if there is none.
     """
     n, m, p = J.shape
@@ -45,18 +48,54 @@ def sandwich(
             rows = rows[np.argsort(frame[rows], kind="stable")]
             groups.append((rows, slice(2 * c, 2 * c + 2), np.diff(frame[rows]) / step))
     chance, variance = _posterior(K, e, groups, known)
-    meat, share = np.zeros((p, p)) + prior, chance * variance
-    for rows, view, gaps in groups:
-        k, decay = K[rows][:, view], _CORRELATIONS[:, None] ** gaps
-        past = np.tile(k[:, None], (1, len(share), 1, 1))  # for each row: the sum of the rows up to it, with decayed weights
-        for before, now, kept in zip(past[:-1], past[1:], decay.T[:, :, None, None], strict=True):
-            now += kept * before
-        half = np.tensordot(k, np.einsum("t,ntip->nip", share, past) - share.sum() / 2 * k, axes=([0, 1], [0, 1]))
-        meat += half + half.T
+    share = chance * variance
+    meat = prior + sum(_correlated(K[rows][:, view], gaps, share) for rows, view, gaps in groups)
+    meat = meat + _shared(J, weight, r, J_x, frame, landmark, share, known)
     sd = np.sqrt(np.diag(known))
     unit = np.outer(sd, sd)
     ratio = np.linalg.slogdet(information * unit)[1] - np.linalg.slogdet(meat * unit)[1]
     return wider * known @ meat @ known, float(n * np.exp(min(ratio / p, 0.0)))
+
+
+def _correlated(K: np.ndarray, gaps: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Covariance (p, p) of the sum of scores K (n, c, p), `share` of whose errors decay with each correlation over the gaps."""
+    decay = _CORRELATIONS[:, None] ** gaps
+    past = np.tile(K[:, None], (1, len(share), 1, 1))  # for each row: the sum of the rows up to it, with decayed weights
+    for before, now, kept in zip(past[:-1], past[1:], decay.T[:, :, None, None], strict=True):
+        now += kept * before
+    half = np.tensordot(K, np.einsum("t,ntip->nip", share, past) - share.sum() / 2 * K, axes=([0, 1], [0, 1]))
+    return half + half.T
+
+
+def _shared(
+    J: np.ndarray, weight: np.ndarray, r: np.ndarray, J_x: np.ndarray, frame: np.ndarray, landmark: np.ndarray,
+    share: np.ndarray, known: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """What errors of the robot's position that the landmarks of a `frame` (n,) share add to the covariance of the scores.
+
+    The products of the residuals of two landmarks in a frame give the variance of these errors.  Their expectation allows for
+    the part of the errors that the fit absorbs, with the `known` covariance (p, p) of independent errors.
+    """
+    frames, place = np.unique(frame, return_inverse=True)
+
+    def total(values: np.ndarray) -> np.ndarray:
+        """The sum in each frame."""
+        sums = np.zeros((len(frames), *values.shape[1:]))
+        np.add.at(sums, place, values)
+        return sums
+
+    moved = np.broadcast_to(weight @ J_x, (len(J), J.shape[1], 3))
+    pull, stiff, scores = np.einsum("nmi,nm->ni", moved, r), J_x.mT @ moved, moved.mT @ J
+    others = total(scores)[place] - scores  # the sums of the other landmarks in the frame, (n, 3, p)
+    product, expected = ((total(one) ** 2).sum() - (one**2).sum() for one in (pull, stiff))
+    pairs = known @ np.tensordot(scores, others, axes=([0, 1], [0, 1]))
+    expected += np.trace(pairs @ pairs) - 2 * np.einsum("nip,nij,njq,pq->", others, stiff, others, known, optimize=True)
+    variance_mm2 = (product + np.trace(pairs)) / max(expected, 1e-300)
+    if len(frames) < 2 or expected <= 0 or variance_mm2 <= 0:
+        return np.zeros_like(known)
+    gaps = np.diff(frames) / np.median(np.diff(frames))
+    own = [_correlated(total(scores * (landmark == k)[:, None, None]), gaps, share) for k in np.unique(landmark)]
+    return variance_mm2 * (_correlated(total(scores), gaps, share) - sum(own))
 
 
 def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +22,7 @@ _SMOOTH_S = 0.1  # the robot's motion is smooth within this time
 #: A minimum of the misfit is clear if it is this far below the median trial in each camera; then landmarks may have constant
 #: offsets.  The second number is the largest residual with such offsets, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
+_MOTION = 1.3  # least information of the velocities on the offset, in units of what the log's noise alone seems to give
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +36,22 @@ class TimeOffset:
     trial_rms_px: np.ndarray
 
 
+@lru_cache
+def _velocity_gain(every: int) -> float:
+    """Noise of a least-squares spline's derivative, by that of samples at 0, 1, 2, ...; a knot for each `every` samples."""
+    time = np.arange(20.0 * every + 1)
+    knots = np.concatenate([np.zeros(4), time[every:-every:every], np.full(4, time[-1])])
+    basis = BSpline(knots, np.eye(len(knots) - 4), 3)
+    slopes = basis(time[8 * every : 12 * every], 1)
+    return float(np.sqrt((slopes * np.linalg.solve(basis(time).T @ basis(time), slopes.T).T).sum(axis=1).mean()))
+
+
 class Paths:
     """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, one for each stretch without a gap.
 
     At 100 Hz the derivative of an interpolating spline is mostly encoder noise, which would bias a regression on it.
     `samples` has for each landmark the times (m,) s, and the positions (m, 3) mm, NaN where the robot reports none.
+    `velocity_sd` are the standard deviations, mm/s, of a coordinate of the landmarks' velocities that the log's noise causes.
 
     >>> time = np.linspace(0, 1, 101)
     >>> paths = Paths([(time, np.outer(time, [1.0, 2.0, 3.0]))])
@@ -48,8 +61,10 @@ class Paths:
 
     def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
         self.pieces: list[list[BSpline]] = []  # for each landmark
+        self.velocity_sd = np.zeros(0)
         for time, x in samples:
             self.pieces.append([])
+            squares, freedom = 0.0, 1.0
             known = np.isfinite(x).all(axis=1)
             time, x = time[known], x[known]
             step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
@@ -60,6 +75,9 @@ class Paths:
                 if len(t) >= 4:
                     knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
                     self.pieces[-1].append(make_lsq_spline(t, part, knots, k=3, method="norm-eq"))
+                    squares += ((part - self.pieces[-1][-1](t)) ** 2).sum()
+                    freedom += 3 * (len(t) - len(self.pieces[-1][-1].c))
+            self.velocity_sd = np.append(self.velocity_sd, np.sqrt(squares / freedom) * _velocity_gain(every) / step)
 
     @property
     def span_s(self) -> float:
@@ -92,7 +110,7 @@ def estimate_time_offset(
             the motion; their noise is averaged over 0.1 s.  NaN = no report; rows in longer gaps are dropped.
         start_s, search_s: Middle and half width of the search.
 
-    A `DataError` refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
+    A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no cameras
     (`NoConsensusError`), and an offset at the edge of the search.
     """
     time, frame, landmark, y = _rows(data)
@@ -111,8 +129,8 @@ def estimate_time_offset(
     def at(offset: float | np.ndarray, derivative: int = 0) -> np.ndarray:
         return paths.at(landmark, time + offset, derivative)
 
-    def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivative of the pixels by the offset (n, m), weights (n, m, m), residuals (n, m); zero in views not used."""
+    def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Derivative of pixels by offset (n, m), weights (n, m, m), residuals (n, m), 0 in views not used; A (1, m, 3)."""
         x, v = at(offset), at(offset, 1)
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
         A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
@@ -123,7 +141,7 @@ def estimate_time_offset(
         for c, rows in enumerate(views.T):
             rest = v[rows] - np.column_stack([x[rows], np.ones(rows.sum())]) @ regress(x[rows], v[rows]).T
             derivative[rows, 2 * c : 2 * c + 2] = rest @ A[2 * c : 2 * c + 2].T
-        return derivative, W, r
+        return derivative, W, r, A[None]
 
     low, high, far_px = start_s - search_s, start_s + search_s, _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
     trial = np.linspace(low, high, _GRID)
@@ -145,10 +163,12 @@ def estimate_time_offset(
         misfit = _rms_px(x_mm, y, views)  # without outliers, squares are more precise than absolute values
         offset = float(trial[misfit.argmin()])
         for _ in range(20):
-            derivative, W, r = linearised(offset)
+            derivative, W, r, A = linearised(offset)
             information = np.einsum("ni,nij,nj->", derivative, W, derivative)
-            if information <= 0:
-                raise DataError("kinematics: the tool's velocity does not vary, so the offset cannot be estimated.")
+            # The log's noise adds to the velocities.  That part seems to determine the offset, but does not.
+            noise = paths.velocity_sd[landmark] ** 2 @ np.broadcast_to(np.einsum("kia,nij,kja->n", A, W, A), len(time))
+            if information <= _MOTION * noise:
+                raise DataError("kinematics: the tool hardly moves, or at a constant velocity; its offset cannot be estimated.")
             step = np.einsum("ni,nij,nj->", derivative, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:
@@ -158,8 +178,8 @@ def estimate_time_offset(
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
         raise DataError(f"search_s: the best offset has an error of {rms_px:.0f} px RMS; widen search_s.")
-    sd = float(np.sqrt(sandwich(derivative[:, :, None], W, r, frame, landmark)[0][0, 0]))
-    return TimeOffset(offset, sd, rms_px, trial, misfit)
+    sd = np.sqrt(sandwich(derivative[:, :, None], W, r, A, frame, landmark)[0][0, 0]) / (1 - noise / information)
+    return TimeOffset(offset, float(sd), rms_px, trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:

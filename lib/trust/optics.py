@@ -214,7 +214,10 @@ def handedness(
     Farther things look smaller (positive `nearness`) unless the world is mirrored.  If the data do not determine `nearness`,
     the tool's direction decides: a microscope sees the tips below the base, so tips nearer to it mean a mirrored world.
     """
-    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
+    views = np.cross(A, np.roll(A, -1, axis=1))[:, 0]  # away from the cameras, if nothing is mirrored
+    if views[0] @ views[1] < 0:
+        return  # one image is mirrored; the verdict names it
+    view = views.sum(axis=0)
     tool = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
     ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # near 0 for a tool across the view
     near, known, (curved, curved_sd) = int((ahead < -_ACROSS).sum()), np.isfinite(ahead).sum(), nearness

@@ -258,16 +258,16 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     text = f"The images are rotated by {roll:.0f} degrees against each other."
     if mirrored not in ("left", "right", "left or right"):  # a mirror image looks rotated, too
         yield "roll", roll, text, "Rotate one of them back: surfaces cannot be matched otherwise.", "turned_image"
-    text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
-    cure = "Flip that image when recording, or change the sign of the axis."
+    text, cure = f"One image is a mirror image ({mirrored}).", "Flip that image when recording."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
     nearness, sd = c.inverse_distance_per_mm
     text = "Farther things look larger: both images are mirrored, or a left-handed robot frame goes with exchanged eyes."
     cure = "Flip both images, or use a right-handed robot frame and exchange left and right."
     yield "hollow", -nearness / sd if sd > 0 else 0.0, text, cure, "mirrored_images"
 
-    text = f"The positions lie only {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
-    yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
+    errs_mm = max(robot_mm, c.sigma_x_mm)
+    text = f"The positions lie only {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {errs_mm:.3f} mm."
+    yield "thin", c.extents_mm[2] / errs_mm, text, "Move the tool along the view as well, and record more frames."
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
@@ -361,7 +361,7 @@ def assess(
     if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        by_labels = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
+        by_labels = ("detector_unfit", "minority", "no_consensus", "no_detection")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)

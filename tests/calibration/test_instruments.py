@@ -63,6 +63,27 @@ def test_time_offset_is_found_within_its_deviation():
     assert abs(none.offset_s) < 3 * none.sd_s
 
 
+@pytest.mark.parametrize("motion", [0.0, 0.01, 0.1])
+def test_time_offset_of_a_tool_that_hardly_moves_is_refused_or_vague(motion):
+    """The noise of the log looks like a velocity, but it does not determine the offset."""
+    distances, refused = [], 0
+    for seed in range(8):
+        rng, robot_time, time = np.random.default_rng(seed), np.arange(-1, 6, 0.01), np.arange(100) / 25
+
+        def at(t):
+            middle = sweep(np.zeros(1)) + motion * (sweep(t) - sweep(np.zeros(1)))
+            return middle[:, None] + np.array([[0, 0, 0], [1.5, 0.4, 2], [1.5, -0.4, 2]])
+
+        u = [rng.normal(p, 1.5).reshape(-1, 3, 2) for p in reference_rig().project(at(time + 0.03).reshape(-1, 3))]
+        try:
+            found = estimate_time_offset((time, u), (robot_time, rng.normal(at(robot_time), 0.01)))
+            distances.append((found.offset_s - 0.03) / found.sd_s)
+        except ValueError as error:
+            refused += "hardly moves" in str(error) or "edge" in str(error)
+    assert refused + len(distances) == 8 and (refused >= 7 if motion < 0.1 else refused == 0)
+    assert np.sqrt(np.mean(np.square(distances or [0]))) < 2.0
+
+
 def test_time_offset_with_missing_detections_and_several_landmarks():
     (time, u), (robot_time, robot_x) = video(-0.02, 1)
     u = [np.stack([p, p], axis=1) for p in u]
@@ -280,6 +301,31 @@ def test_tool_offsets_from_poses_and_images():
         assert found.rms_px == pytest.approx(1.5 * np.sqrt(2), rel=0.1)
         assert found.positions_mm(tool).shape == (300, 3, 3)
     assert np.sqrt(np.mean(np.square(errors))) < 0.005
+
+
+def test_the_covariance_of_tool_offsets_holds_the_noise_of_the_poses():
+    distances = []
+    for seed in range(12):
+        tool, rng = poses(40, seed), np.random.default_rng(seed)
+        u = [rng.normal([c.project(p.apply(OFFSETS)) for p in tool], 1.5) for c in (reference_rig().left, reference_rig().right)]
+        reported = [RigidTransform(p.R, p.t + rng.normal(0, 0.03, 3)) for p in tool]
+        found = tool_offsets(reported, u)
+        error = found.offset_mm - OFFSETS
+        distances.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_mm2), error).mean() / 3)
+    assert 0.5 < np.mean(distances) < 1.8
+
+
+def test_tool_offsets_name_what_is_wrong():
+    tool = poses(30, 0)
+    u = [np.stack([c.project(p.apply(OFFSETS)) for p in tool]) for c in (reference_rig().left, reference_rig().right)]
+    with pytest.raises(ValueError, match=r"opening_rad: expected \(30,\) angles"):
+        tool_offsets(tool, u, opening_rad=np.full(20, 0.3))
+    with pytest.raises(ValueError, match="in radians"):
+        tool_offsets(tool, u, opening_rad=np.linspace(5, 35, 30))
+    with pytest.raises(ValueError, match=r"turning: expected \(3,\)"):
+        tool_offsets(tool, u, turning=[0, 1])
+    with pytest.raises(ValueError, match="landmark 1 is in no frame"):
+        tool_offsets(tool, [np.where(np.arange(3)[:, None] == 1, np.nan, p) for p in u])
 
 
 def test_pivot_calibration():

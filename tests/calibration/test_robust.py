@@ -137,3 +137,18 @@ def test_positions_that_repeat_calibrate_or_are_named(places):
         assert places == 3 and "coplanar" in str(error)
     else:
         assert found.inliers.mean() > 0.95
+
+
+@pytest.mark.parametrize("share", [0.45, 0.5, 0.55])
+def test_a_glint_that_stands_still_is_no_tool(share):
+    for seed in range(4):
+        rows, rig, x_mm = tool_sweep(seed, frames=60)
+        rng = np.random.default_rng(seed)
+        u = [np.where(rng.random((180, 1)) < share, [700.0, 300.0] + rng.normal(0, 2, p.shape), p) for p in rig.project(x_mm)]
+        try:
+            found = calibrate(rows.x_mm, u)
+        except NoConsensusError as error:
+            assert "stand still in the image" in str(error) or "compete" in str(error)
+        else:
+            off = np.hstack(found.rig.project(x_mm)) - np.hstack(rig.project(x_mm))
+            assert np.sqrt(np.mean(off**2)) < 3.0

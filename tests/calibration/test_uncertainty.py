@@ -5,9 +5,11 @@ import pytest
 
 from lib.calibration import calibrate, dlt, optics
 from lib.cameras import NearAffineCamera
+from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.positions import added_error, box_grid, next_positions
 from notebooks.studies.simulated_rows import simulate_correspondences
+from tests.calibration.rigs import tool_sweep
 
 
 def made(n=150, seed=0, model="affine", **options):
@@ -78,6 +80,29 @@ def test_covariance_of_points_holds_calibration_and_detection():
         distances.append(error @ np.linalg.solve(covariance, error))
         assert (np.linalg.eigvalsh(covariance - found.point_covariance(x_mm, detection=False)[0]) > 0).all()
     assert np.mean(distances) == pytest.approx(3, rel=0.15)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_covariance_allows_for_errors_that_the_landmarks_of_a_frame_share(shared):
+    """A robot that reports poses errs alike in all landmarks of a frame."""
+    rig, distances, effective = reference_rig(), [], []
+    corners = ROBOT_FROM_MICROSCOPE.apply(np.random.default_rng(5).uniform(-1, 1, (12, 3)) * [6, 4, 1.5])
+    for seed in range(12):
+        _, _, x_mm = tool_sweep(seed, frames=40, offset_mm=np.zeros((3, 3)))
+        rng = np.random.default_rng(seed)
+        u = [p + rng.normal(0, 0.7, p.shape) for p in rig.project(x_mm)]
+        frame, landmark = np.divmod(np.arange(120), 3)
+        error_mm = rng.normal(0, 0.03, (120, 3))
+        reported = x_mm + (error_mm[3 * frame] if shared else error_mm)
+        rows = Correspondences.of_points(reported, *u, frame=frame, landmark=landmark)
+        found = calibrate(rows, offsets=False)
+        off = np.hstack(found.rig.project(corners)) - np.hstack(rig.project(corners))
+        J = found.derivatives(corners)[1].reshape(-1, len(found.parameter_names))
+        step = np.linalg.lstsq(J, off.ravel(), rcond=None)[0]
+        distances.append(step @ np.linalg.solve(found.parameter_covariance, step) / len(step))
+        effective.append(found.effective_rows)
+    assert 0.6 < np.mean(distances) < 1.3  # 1.8 if shared errors are taken for independent ones
+    assert np.mean(effective) < 100 if shared else np.mean(effective) > 115
 
 
 def test_depth_map_grows_away_from_the_data():

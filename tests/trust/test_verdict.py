@@ -90,6 +90,27 @@ def test_few_clean_rows_in_a_plane_are_calibrated_and_never_trusted(half_depth_m
         assert (error**2).sum(axis=1).mean() < 16 * np.trace(own, axis1=1, axis2=2).mean()
 
 
+def test_a_plane_that_the_robots_own_noise_thickens_is_not_trusted():
+    """The fit finds that the robot errs by 50 um, not by the 10 um that are stated."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        x_mm = ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-1, 1, (60, 3)) * [6, 4, 0])
+        u = [rng.normal(p, 1.0) for p in reference_rig().project(x_mm)]
+        reported_mm = x_mm + rng.normal(0, 0.05, x_mm.shape)
+        verdict = judge(Correspondences.of_points(reported_mm, *u), calibrate(reported_mm, u))
+        assert next(reason.level for reason in verdict.reasons if reason.name == "thin") == LEVELS[2]
+
+
+@pytest.mark.parametrize("eyes", [(0, 1), (1, 0)])
+def test_one_mirrored_image_is_not_called_two(eyes):
+    """The viewing directions of the two cameras cancel, so the tool's direction says nothing about up and down."""
+    scene = spoiling.Scene(np.random.default_rng(3), frames=45)
+    scene.edit_pixels.append(lambda scene, u: np.stack([u[:, :, eyes[0]] * [-1, 1] + [1919, 0], u[:, :, eyes[1]]], axis=2))
+    scene = scene.take()
+    found = diagnose(scene.data, kinematics=scene.kinematics, image_size_px=scene.image_size_px)
+    assert not any(h.name == "mirrored_images" for h in found.hypotheses)
+
+
 @pytest.mark.parametrize(("moves_mm", "expected"), [
     ((6.0, 0.0, 0.0), {"one_line": LEVELS[2]}),  # its cameras have oblong pixels, which is no fault of axes or units
     ((6.0, 3.0, 0.0), {"one_plane": LEVELS[1]}),
@@ -218,6 +239,9 @@ def test_no_detection_is_one_message():
     text = r"detector failed on 60 frames: of 60 .* found 60 in left images and 0 in right"
     with pytest.raises(NoDetectionError, match=text) as error:
         calibrate(nothing)
+    by_hand = replace(data, u_left=np.where(np.arange(60)[:, None] < 3, data.u_left, np.nan))
+    with pytest.raises(NoDetectionError, match="data: 3 landmarks are labelled in left images and 60 in right ones, .* Label ten"):
+        calibrate(replace(by_hand, covariance_px2=np.full((60, 2, 2, 2), np.nan)))
     verdict = judge(nothing, None, error=error.value)
     assert [reason.name for reason in verdict.reasons] == ["no_detection"] and verdict.is_red
     with pytest.raises(NoDetectionError, match="the robot reports a position for 0 of the 60 landmarks"):
