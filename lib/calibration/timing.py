@@ -110,8 +110,8 @@ def estimate_time_offset(
             the motion; their noise is averaged over 0.1 s.  NaN = no report; rows in longer gaps are dropped.
         start_s, search_s: Middle and half width of the search.
 
-    A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no cameras
-    (`NoConsensusError`), and an offset at the edge of the search.
+    A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no
+    cameras (`NoConsensusError`), and an offset at the edge of the search.
     """
     time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics)
@@ -168,7 +168,7 @@ def estimate_time_offset(
             # The log's noise adds to the velocities.  That part seems to determine the offset, but does not.
             noise = paths.velocity_sd[landmark] ** 2 @ np.broadcast_to(np.einsum("kia,nij,kja->n", A, W, A), len(time))
             if information <= _MOTION * noise:
-                raise DataError("kinematics: the tool hardly moves, or at a constant velocity; its offset cannot be estimated.")
+                raise DataError("kinematics: the tool hardly moves, or at constant velocity; no offset can be estimated.")
             step = np.einsum("ni,nij,nj->", derivative, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:

@@ -307,7 +307,8 @@ def test_the_covariance_of_tool_offsets_holds_the_noise_of_the_poses():
     distances = []
     for seed in range(12):
         tool, rng = poses(40, seed), np.random.default_rng(seed)
-        u = [rng.normal([c.project(p.apply(OFFSETS)) for p in tool], 1.5) for c in (reference_rig().left, reference_rig().right)]
+        cameras = reference_rig().left, reference_rig().right
+        u = [rng.normal([camera.project(p.apply(OFFSETS)) for p in tool], 1.5) for camera in cameras]
         reported = [RigidTransform(p.R, p.t + rng.normal(0, 0.03, 3)) for p in tool]
         found = tool_offsets(reported, u)
         error = found.offset_mm - OFFSETS

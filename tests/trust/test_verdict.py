@@ -240,7 +240,7 @@ def test_no_detection_is_one_message():
     with pytest.raises(NoDetectionError, match=text) as error:
         calibrate(nothing)
     by_hand = replace(data, u_left=np.where(np.arange(60)[:, None] < 3, data.u_left, np.nan))
-    with pytest.raises(NoDetectionError, match="data: 3 landmarks are labelled in left images and 60 in right ones, .* Label ten"):
+    with pytest.raises(NoDetectionError, match="data: 3 landmarks are labelled in left images and 60 in right .* Label ten"):
         calibrate(replace(by_hand, covariance_px2=np.full((60, 2, 2, 2), np.nan)))
     verdict = judge(nothing, None, error=error.value)
     assert [reason.name for reason in verdict.reasons] == ["no_detection"] and verdict.is_red
