@@ -229,11 +229,13 @@ def test_conclusions_hold_in_the_newest_run():
                     assert "recorded" in text, f"{path.stem}: say that it is recorded: {text}"
 
 
-def test_a_difference_is_refused_and_a_claim_that_fails_says_so(monkeypatch):
+def test_a_difference_is_refused_and_a_claim_that_fails_says_so(monkeypatch, capsys):
     with pytest.raises(AssertionError, match="differ by 1"):
         course.agree("x", [1.0, 2.0], [1.0, 3.0], within=1e-6)
     with pytest.raises(AssertionError):
         course.agree("x", [np.nan], [0.0], within=1.0)
+    course.agree("x", 1.0, 4.5, within=6, unit="grey levels")
+    assert capsys.readouterr().out == "x: this cell and lib differ by 3.5e+00 grey levels; up to 6 is accepted.\n"
     monkeypatch.setattr(report, "RECORDED", {"a_um": 3.0, "b_um": 1.0, "c_um": None})
     told = {"Wide: {a_um:.0f} um.": "{a_um} > 2", "Small: {b_um:.0f} um.": "{b_um} > 2", "{c_um}": "{c_um} > 0"}
     page = course.learnt(told).data

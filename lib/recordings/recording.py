@@ -149,7 +149,9 @@ class Recording:
         size, skeleton = header["image_size_px"], header["skeleton"]
         (n, left), (n_right, right) = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
         if n != n_right:
-            raise ValueError(f"{folder}: {n} left and {n_right} right frames; they come in pairs.")
+            fewer, more = ("left", "right") if n < n_right else ("right", "left")
+            cure = f"Add the frames of the {fewer} camera from {min(n, n_right):06d} on, or remove those of the {more} one"
+            raise ValueError(f"{folder}: {n} left and {n_right} right frames; they come in pairs. {cure}.")
         if not n:
             raise ValueError(f"{folder}: the recording is empty; it has no frame.")
         time_s, path = np.arange(n) / header["fps"], folder / "frames.csv"

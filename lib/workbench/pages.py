@@ -128,7 +128,8 @@ def is_recorded(metric: dict) -> bool:
 def headlines(run: dict) -> tuple[list[dict], list[str]]:
     """The rows of the table at the top of index.html, and the names of rows that need a truth that the recording lacks.
 
-    ``templates/headlines.toml`` lists these numbers and their targets; `run` is the content of metrics.json.
+    ``templates/headlines.toml`` lists these numbers and their targets; `run` is the content of metrics.json.  A light judges
+    the run's number, or the recorded one if a run has too few images.
     """
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
     own = bool(run["parameters"].get("recording"))
@@ -137,6 +138,8 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
         live = metrics.get(line["name"])
         record = None if own else metrics.get(line.get("recorded"))
         here = bool(live) and live["value"] is not None
+        judged = ((record if line.get("judged") == "recorded" else live) or {}).get("value")
+        judged = math.nan if judged is None else judged  # no number lies in any range
         if own and (line.get("elsewhere") or (line.get("truth") and not here)):
             left_out += [] if line.get("elsewhere") else [line["words"]]
             continue
@@ -144,7 +147,7 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
         before = run.get("previous", {}).get(line["name"])
         book = books.get(line["notebook"], {"state": None})
         lights = {"met": line["target"], "close": line["close"], "missed": (-math.inf, math.inf)}
-        fitting = (light for light, (low, high) in lights.items() if here and low <= live["value"] <= high)
+        fitting = (light for light, (low, high) in lights.items() if low <= judged <= high)
         rows.append(line | {
             "light": next(fitting, "missing"),
             "target": _range(*line["target"], unit),

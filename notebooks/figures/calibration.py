@@ -381,11 +381,13 @@ def estimators(chosen: Table, fresh: Table) -> Figure:
             ax.bar(at + offset, values, 0.4, color=COLOURS[colour], label=f"{name} ({len(table)})")
             for x, value, column in zip(at + offset, values, columns, strict=True):
                 ax.plot(np.full(len(column), x), column, ".", color="black", markersize=3)
-                ax.text(x, value + 0.02, f"{value:.2f}", ha="center", fontsize=8, bbox=_WHITE, zorder=3)
+                ax.text(x, -0.03, f"{value:.2f}", ha="center", va="top", fontsize=8)  # below all bars and dots
         ax.axhline(1, color="black", linewidth=0.8)
         ax.set(xticks=at, title=title)
         ax.set_xticklabels([n.replace("_", "\n") for n in names])
         ax.grid(axis="x", visible=False)
+    axes[0].set_ylim(bottom=-0.2)
+    axes[0].set_yticks([tick for tick in axes[0].get_yticks() if 0 <= tick <= axes[0].get_ylim()[1]])
     axes[0].set_ylabel("error / Cramer-Rao bound")
     axes[0].legend(fontsize=8)
     return page

@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"\{([a-z][a-z0-9_.]*?)(:[^{}]*)?\}")
 def agree(what: str, here: ArrayLike, library: ArrayLike, *, within: float, unit: str = "") -> None:
     """Print the largest difference between a cell's own result and the library's; AssertionError if it exceeds `within`."""
     gap = float(np.max(np.abs(np.asarray(here, dtype=float) - np.asarray(library, dtype=float))))
-    line = f"{what}: this cell and lib differ by {gap:.1e} {unit}".rstrip() + f"; up to {within:g} counts as rounding."
+    line = f"{what}: this cell and lib differ by {gap:.1e} {unit}".rstrip() + f"; up to {within:g} is accepted."
     assert gap <= within, line  # a NaN fails too
     print(line)
 

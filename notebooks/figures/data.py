@@ -137,7 +137,7 @@ def volume_page(recording: Recording) -> Figure:
     else:
         axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title="Positions reported by the robot")
     axes[0].set_aspect("equal")
-    axes[0].legend(fontsize=8)
+    page.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower left", ncols=3)
     axes[1].set(xlabel=f"{'depth' if truth else 'robot z'} minus its mean (mm)", title="Depths of the landmarks")
     axes[1].set_yticks(range(3), LANDMARK_COLOURS)
     axes[1].set_ylim(2.6, -0.6)

@@ -256,7 +256,7 @@ def held_out_curve(
     side = "" if error_um is None else " (left axis)"
     ax.plot(held_out[:, 0], excess, "o-", color=COLOURS["ours"], label=f"held-out error{side}")
     ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
-    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the smallest (%)")
+    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out error above the least (%)")
     ax.set_yscale("symlog", linthresh=0.1)
     ax.set_ylim(-0.02, 3 * excess.max() + 0.1)
     ax.yaxis.set_major_formatter("{x:g}")

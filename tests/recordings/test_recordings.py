@@ -271,7 +271,9 @@ SPOILERS = {
     "units": (lambda f: edit(f / "recording.toml", 'length = "mm"', 'length = "m"'), ValueError, "units.length = 'm'"),
     "skeleton": (lambda f: edit(f / "recording.toml", '"tip_1", "tip_2"', '"tip_2", "tip_1"'), ValueError, "skeleton"),
     "missing frame": (lambda f: (f / "left/000001.png").unlink(), ValueError, "frame 000001 is missing"),
-    "mismatched counts": (lambda f: (f / "right/000003.png").unlink(), ValueError, "4 left and 3 right"),
+    "mismatched counts": (lambda f: (f / "right/000003.png").unlink(), ValueError,
+                          r"4 left and 3 right .* Add the frames of the right camera from 000003 on, or .* the left one\.$"),
+    "mismatched counts, left": (lambda f: (f / "left/000003.png").unlink(), ValueError, "of the left camera from 000003 on"),
     "misnamed frame": (lambda f: (f / "left/000003.png").rename(f / "left/last.png"), ValueError, "named by number"),
     "not an image": (
         lambda f: (f / "left/000002.png").write_bytes(b"hello"),

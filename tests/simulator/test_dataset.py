@@ -7,13 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 from lib import paths
 from lib.recordings import Recording
 from lib.simulator.dataset import main, make_dataset, sequence_design, sequence_name
-from notebooks.figures.data import landmark_counts
+from notebooks.figures.data import landmark_counts, volume_page
 
 OPTIONS = {"n_pairs": 2, "duration_s": 1.0, "shrink": 16}  # 120 x 67 px
 WORDS = ["--pairs", "2", "--duration", "1", "--shrink", "16"]
@@ -51,6 +52,15 @@ def test_splits_by_eye_and_tool(made):
     counts = landmark_counts(recordings)
     assert {sum(counts[name][k] for k in ("visible", "hidden", "outside")) for name in counts} == {10 * 2 * 2}
     assert counts["base"]["visible"] > 20 and "in_glint" in counts["tip_1"]
+
+
+def test_the_legend_of_the_labels_covers_no_point():
+    page = volume_page(Recording.open(paths.SHIPPED_RECORDING))
+    page.canvas.draw()
+    (legend,) = page.legends
+    for axes in page.axes:
+        assert axes.get_legend() is None and not legend.get_window_extent().overlaps(axes.get_window_extent())
+    plt.close(page)
 
 
 def test_a_killed_run_resumes_to_the_same_files(made, tmp_path, capfd):

@@ -228,6 +228,9 @@ def test_figures_draw_the_recorded_tables():
     ]
     for page in drawn:
         assert all(ax.has_data() for ax in page.axes)
+    told = [text.get_window_extent() for ax in drawn[-1].axes for text in ax.texts]
+    zero = min(ax.transData.transform((0, 0))[1] for ax in drawn[-1].axes)
+    assert told and max(box.y1 for box in told) < zero, "numbers lie on no dot"
     plt.close("all")
 
 

@@ -253,6 +253,9 @@ def test_every_figure_draws(scene, result):
     for page in pages:
         page.set_dpi(30)  # pixels take time, and nobody looks at them
         page.canvas.draw()
+        labels = {axes.get_ylabel(): axes.yaxis.label.get_window_extent() for axes in page.axes if axes.get_ylabel()}
+        cut_off = [text for text, box in labels.items() if box.y0 < 0 or box.y1 > page.bbox.height]
+        assert not cut_off
         plt.close(page)
     from notebooks.figures import interactive
 

@@ -8,6 +8,8 @@ import re
 import nbformat
 
 from lib import paths
+from lib.simulator.families import FAR
+from lib.workbench import results
 from lib.workbench.command import previous_values
 from lib.workbench.pages import headlines, index_html, markdown_html
 
@@ -115,6 +117,15 @@ def test_a_record_is_never_this_run():
     shipped = metric("landmark_shipped_whole_frames_median_px", 0.4, note="recorded, 4 seeds")
     first, *_ = headlines(finished(shipped))[0]
     assert first["light"] == "missing" and first["recorded"] == "0.4 px" and first["value"] != "0.4 px"
+
+
+def test_ten_images_of_a_run_do_not_meet_a_target_that_hundreds_miss():
+    numbers = metric("landmark_rung_far_pck_0.2", 86.4, "%"), metric("landmark_far_recorded_pck_0.2", 74.0, "%")
+    far = headlines(finished(*numbers))[0][-1]
+    assert (far["light"], far["value"], far["recorded"]) == ("close", "86.4 %", "74 %")
+    assert headlines(finished(numbers[0]))[0][-1]["light"] == "missing", "nothing to judge by"
+    images = sum(row["images"] for row in results.read("rungs").rows if row["rung"] in FAR)
+    assert f"the recorded number, from {images:.0f} images" in far["words"]
 
 
 def test_a_recording_without_truth_shows_only_what_needs_none():
