@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--features", type=int, help="number of channels (default: as in the shipped detector)")
     add("--seed", type=int, default=0)
     add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from")
-    add("--every", type=int, default=1, help="finetune: use every N-th frame")
+    add("--every", type=int, default=1, help="finetune: use every N-th labelled frame")
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     a = parser.parse_args(argv)
@@ -109,7 +109,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=main_evaluate.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
     parser.add_argument("--weights", help="weights file or name in data/models (default: the shipped ones)")
-    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
+    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th labelled frame")
     parser.add_argument("--json", type=Path, help="write the scores here")
     a = parser.parse_args(argv)
     if a.every < 1:

@@ -28,7 +28,7 @@ from lib.training.drawings import drawn_ground
 from lib.training.error_models import fit_error_models
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, TrainingConfig, load_training, train
-from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_images
+from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_frames, labelled_images
 from lib.training.shards import validation_images
 from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
@@ -178,8 +178,8 @@ def assemble(
     grounds = (drawn_ground(one.image, rng) for one in frames[::8])
     bare = [LabelledImage(f"bare {i}", image, np.full((3, 2), np.nan), np.zeros(3)) for i, image in enumerate(grounds)]
     near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
-    opened = map(Recording.open, recordings)  # 16 images of each, spread over it
-    typical = [one for own in opened for one in labelled_images(own, every=max(1, len(own.frames) // 8))]
+    opened = map(Recording.open, recordings)  # the images of about 8 labelled frames of each, spread over it
+    typical = [one for own in opened for one in labelled_images(own, every=max(1, len(labelled_frames(own)) // 8))]
     networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0])
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)

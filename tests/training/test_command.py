@@ -11,12 +11,14 @@ import torch
 
 from lib import paths
 from lib.__main__ import COMMANDS
-from lib.landmarks import Detector
+from lib.landmarks import Detector, Landmarks
 from lib.landmarks.detector import CLOSE
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.recordings import Annotations, Recording
 from lib.training import command, stages
 from lib.training.command import main_evaluate
+from lib.training.evaluation import evaluate
 from lib.training.loop import load_training
 from lib.training.sources import FrameSource
 from tests.toys import toy_images
@@ -103,6 +105,29 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     assert kept.closeup_network is closeup and kept.tool_network is not hourglass  # held-out images prefer those from before
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
         stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
+
+
+def test_assembly_takes_labelled_frames_from_all_over_a_recording(tmp_path, monkeypatch):
+    """Labels in ten of the 34 frames; networks, renderer and fits are replaced by stand-ins."""
+    images, fitted_on = toy_images(8), []
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    seen = np.zeros((len(recording), 3), int)
+    seen[[1, 2, 3, 5, 9, 14, 21, 22, 23, 33]] = 2
+    labels = Annotations(*np.full((2, len(recording), 3, 2), 40.0), seen, 0 * seen)
+    monkeypatch.setattr(Recording, "open", lambda folder: replace(recording, truth=None, annotations=labels))
+    monkeypatch.setattr(stages, "validation_images", lambda data: images)
+    monkeypatch.setattr(stages, "sample", lambda rng, **options: images[0][1:])
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, shown, **options: fitted_on.extend(shown) or d)
+    missed = lambda shown: Landmarks.none(len(shown))  # noqa: E731
+    monkeypatch.setattr(stages, "evaluate", lambda d, shown, progress: evaluate(missed, shown))
+    monkeypatch.setattr(stages, "card", lambda detector, path: "")
+    monkeypatch.setattr(Detector, "save", lambda detector, path: None)
+    hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
+    initial = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
+    rest = {"recordings": [Path("ours")], "initial": initial}
+    made = stages.assemble(tmp_path, tmp_path, tmp_path / "made.safetensors", **rest)
+    names = [one.name for one in fitted_on if one.name.startswith("left")]
+    assert names == [f"left {i}" for i in (1, 2, 3, 5, 9, 14, 21, 22, 23, 33)] and made.metadata["recorded_frames"] == 10
 
 
 def test_time_ends_fine_tuning(tmp_path, monkeypatch):
