@@ -12,7 +12,7 @@ from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
 from lib.training.samples import labelled_images
-from lib.training.shards import generate, propose
+from lib.training.shards import generate, propose, shards_of
 from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of
 
 
@@ -97,7 +97,7 @@ def _finetune(a: argparse.Namespace) -> None:
         training += images[: 3 * len(images) // 4]
         held_out += images[3 * len(images) // 4 :]
     detector = Detector.load(a.initial)
-    options = {"simulated": a.data if any(a.data.glob("scenes_*.npz")) else None, "steps": a.steps, "minutes": a.minutes}
+    options = {"simulated": a.data if shards_of(a.data, "scenes") else None, "steps": a.steps, "minutes": a.minutes}
     tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **options)
     tuned.save(a.out)
     for name, scores in (("before", evaluate(detector, held_out).scores), ("after", evaluate(tuned, held_out).scores)):
