@@ -8,6 +8,7 @@ from pathlib import Path
 from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
+from lib.provenance import plain
 from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
@@ -91,11 +92,15 @@ def _start(path: Path, stage: str) -> Training:
 def _finetune(a: argparse.Namespace) -> None:
     if not a.recordings or a.out is None:
         raise ValueError("finetune: give labelled recordings, and a weights file to write with --out.")
+    a.out.parent.mkdir(parents=True, exist_ok=True)  # it fails before the training, not after it
     training, held_out = [], []
     for recording in map(Recording.open, a.recordings):
         images = list(labelled_images(recording, every=a.every))
-        training += images[: 3 * len(images) // 4]
-        held_out += images[3 * len(images) // 4 :]
+        cut = 3 * len(images) // 4
+        if cut and images[cut].name.split()[1] == images[cut - 1].name.split()[1]:
+            cut -= 1  # both views of a frame are held out
+        training += images[:cut]
+        held_out += images[cut:]
     detector = Detector.load(a.initial)
     options = {"simulated": a.data if shards_of(a.data, "scenes") else None, "steps": a.steps, "minutes": a.minutes}
     tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **options)
@@ -129,7 +134,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     for name, value in result.detection().items():
         print(f"{name.replace('_', ' ')}, confidence above 0.5: {value:.1f} %")
     if a.json:
-        write_json(a.json, {name: asdict(s) for name, s in rows.items()})
+        write_json(a.json, plain({name: asdict(s) for name, s in rows.items()}))
     return 0
 
 

@@ -84,6 +84,10 @@ def test_groups_have_their_own_scores():
 def test_nothing_to_evaluate_is_named():
     with pytest.raises(ValueError, match="images: no labelled image"):
         evaluate(off_by(0.0), [])
+    absent = evaluate(off_by(0.0), [one._replace(visibility=np.zeros(3)) for one in IMAGES])
+    assert absent.detection()["in_view_precision"] == 0
+    with pytest.raises(ValueError, match="images: no label is in view"):
+        absent.scores  # noqa: B018
 
 
 def test_labels_are_the_truth_or_else_the_annotations():
