@@ -65,6 +65,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def lives(pid: int) -> bool:
+    """True if a process of this machine runs; a zombie, which has ended, does not."""
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
+
+
 @contextlib.contextmanager
 def single_threaded_torch() -> Iterator[None]:
     """Run the block with a single torch thread: for many small tensors more threads only waste time."""

@@ -38,7 +38,7 @@ def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dic
     try:
         files.write_bytes(path, safetensors_bytes(tensors, metadata=texts))
     except OSError as error:
-        raise OSError(error.errno, f"{path}: not saved ({error.strerror}); an earlier file there is unharmed") from error
+        raise OSError(f"{path}: not saved ({error.strerror or error}); an earlier file there is unharmed") from error
 
 
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
@@ -55,10 +55,10 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
         metadata = {name: json.loads(value) for name, value in texts.items()}
     except (SafetensorError, ValueError, OSError) as error:
         raise ValueError(f"{path}: corrupt, or not a weights file of this program ({error}); {_CURE}") from error
+    if "format" in metadata and metadata.pop("sha256", None) != checksum(tensors, texts):  # of whatever kind
+        raise ValueError(f"{path}: damaged, its SHA-256 checksum is missing or does not fit its content; {_CURE}")
     if metadata.get("format") != kind:
         raise ValueError(f"{path}: holds {metadata.get('format', 'foreign weights')!r}, expected {kind!r}; {_CURE}")
-    if metadata.pop("sha256", None) != checksum(tensors, texts):
-        raise ValueError(f"{path}: damaged, its SHA-256 checksum is missing or does not fit its content; {_CURE}")
     return tensors, metadata
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from lib import files, paths
-from lib.parallel import cores, run_jobs
+from lib.parallel import cores, lives, run_jobs
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.families import FAR
@@ -79,22 +79,28 @@ def make_dataset(
     A sequence appears whole or not at all: after a kill, the next call keeps the finished ones and makes the others.
     `workers` is the number of processes; None = one per core.  Raises ValueError if `folder` holds another data set.
     """
+    text = _stamp(folder, seed, n_pairs, duration_s, shrink)
     folder.mkdir(parents=True, exist_ok=True)
-    stamp = folder / "dataset.json"
-    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
-    text = json.dumps({"seed": seed, **size}, indent=1) + "\n"
-    if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
-        raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
-    files.write_text(stamp, text)
-    for leftover in folder.glob("t*_??.*.partial"):
-        shutil.rmtree(leftover)  # from a killed run
+    files.write_text(folder / "dataset.json", text)
+    for leftover in folder.glob("t*_??.[0-9]*-*.partial"):  # of a killed run, unless another run is writing it
+        if not lives(int(leftover.suffixes[0][1:].partition("-")[0])):
+            shutil.rmtree(leftover, ignore_errors=True)
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
     make = partial(simulate, description="Simulated data set: calibration sweep, then a surgeon's movements.", progress=False)
-    for _, error in run_jobs(make, jobs, workers=workers, title="Simulating", unit="sequence"):
-        if error:
+    for sequence, error in run_jobs(make, jobs, workers=workers, title="Simulating", unit="sequence"):
+        if error and not sequence.exists():  # else another run was faster
             raise error
     return list(jobs)
+
+
+def _stamp(folder: Path, seed: int, n_pairs: int, duration_s: float, shrink: int) -> str:
+    """The text of a data set's dataset.json; a ValueError if `folder` holds another data set."""
+    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
+    stamp, text = folder / "dataset.json", json.dumps({"seed": seed, **size}, indent=1) + "\n"
+    if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
+        raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
+    return text
 
 
 def seconds_a_pair(shrink: int) -> float:
@@ -116,10 +122,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--duration", type=float, default=60.0, help="seconds of motion per sequence (default: 60)")
     parser.add_argument("--workers", type=int, help="number of processes (default: one per core)")
     parser.add_argument("--shrink", type=int, default=1, help="make images this many times smaller, for a quick look")
-    parser.add_argument("--dry-run", action="store_true", help="only print the time and the disk space that it takes")
-    parser.add_argument("--shipped", action="store_true", help="make data/open_sky_eye again instead")
-    parser.add_argument("--rung", choices=("near", "validation", *FAR), help="make one recording with this shift instead")
+    parser.add_argument("--overwrite", action="store_true", help="--rung: replace the recording of the folder")
+    only = parser.add_mutually_exclusive_group().add_argument
+    only("--dry-run", action="store_true", help="only print the time and the disk space that the data set takes")
+    only("--shipped", action="store_true", help="make data/open_sky_eye again instead; takes no other option")
+    only("--rung", choices=("near", "validation", *FAR), help="make one recording with this shift instead")
     arguments = parser.parse_args(argv)
+    given = {name for name, value in vars(arguments).items() if value != parser.get_default(name)}
+    if (arguments.shipped and given != {"shipped"}) or (arguments.overwrite and not arguments.rung):
+        parser.error("--shipped takes no other option, and --overwrite is for --rung.")
     if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
@@ -135,10 +146,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         else:
             folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{seed}"
             design = replace(rung_design(arguments.rung, seed, shrink=shrink), duration_s=arguments.duration)
-            recording = simulate(folder, design, seed=5000 + seed, n_frames=pairs)
+            recording = simulate(folder, design, seed=5000 + seed, n_frames=pairs, overwrite=arguments.overwrite)
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{seed}"
+    _stamp(folder, seed, pairs, arguments.duration, shrink)
     made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
     for sequence in made:  # finished sequences must open as recordings
         try:

@@ -74,6 +74,8 @@ def simulate(
     motion = Motion(forceps, eye, kind=design.motion, seed=seed, duration_s=duration_s)
     step = max(1, int(motion.duration_s * microscope.fps / n_frames))
     time_s = np.arange(n_frames) * step / microscope.fps
+    if time_s[-1] > motion.duration_s:
+        raise ValueError(f"n_frames: {n_frames} at {microscope.fps:g} Hz last longer than the motion's {duration_s:g} s.")
     details = {"simulated": True, "seed": seed, "frame_step": step}
     details |= {"depth_of_field_mm": microscope.depth_of_field_mm, "exposure_s": microscope.exposure_s}
     if microscope.inverse_distance_per_mm:

@@ -8,11 +8,12 @@ from pathlib import Path
 from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
+from lib.provenance import plain
 from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
 from lib.training.samples import labelled_images
-from lib.training.shards import generate, propose
+from lib.training.shards import generate, propose, shards_of
 from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of
 
 
@@ -40,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--features", type=int, help="number of channels (default: as in the shipped detector)")
     add("--seed", type=int, default=0)
     add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from")
-    add("--every", type=int, default=1, help="finetune: use every N-th frame")
+    add("--every", type=int, default=1, help="finetune: use every N-th labelled frame")
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     a = parser.parse_args(argv)
@@ -91,13 +92,17 @@ def _start(path: Path, stage: str) -> Training:
 def _finetune(a: argparse.Namespace) -> None:
     if not a.recordings or a.out is None:
         raise ValueError("finetune: give labelled recordings, and a weights file to write with --out.")
+    a.out.parent.mkdir(parents=True, exist_ok=True)  # it fails before the training, not after it
     training, held_out = [], []
     for recording in map(Recording.open, a.recordings):
         images = list(labelled_images(recording, every=a.every))
-        training += images[: 3 * len(images) // 4]
-        held_out += images[3 * len(images) // 4 :]
+        cut = 3 * len(images) // 4
+        if cut and images[cut].name.split()[1] == images[cut - 1].name.split()[1]:
+            cut -= 1  # both views of a frame are held out
+        training += images[:cut]
+        held_out += images[cut:]
     detector = Detector.load(a.initial)
-    options = {"simulated": a.data if any(a.data.glob("scenes_*.npz")) else None, "steps": a.steps, "minutes": a.minutes}
+    options = {"simulated": a.data if shards_of(a.data, "scenes") else None, "steps": a.steps, "minutes": a.minutes}
     tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **options)
     tuned.save(a.out)
     for name, scores in (("before", evaluate(detector, held_out).scores), ("after", evaluate(tuned, held_out).scores)):
@@ -109,7 +114,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=main_evaluate.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
     parser.add_argument("--weights", help="weights file or name in data/models (default: the shipped ones)")
-    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
+    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th labelled frame")
     parser.add_argument("--json", type=Path, help="write the scores here")
     a = parser.parse_args(argv)
     if a.every < 1:
@@ -129,7 +134,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     for name, value in result.detection().items():
         print(f"{name.replace('_', ' ')}, confidence above 0.5: {value:.1f} %")
     if a.json:
-        write_json(a.json, {name: asdict(s) for name, s in rows.items()})
+        write_json(a.json, plain({name: asdict(s) for name, s in rows.items()}))
     return 0
 
 

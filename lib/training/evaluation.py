@@ -38,8 +38,10 @@ class Evaluation(NamedTuple):
 
     @property
     def scores(self) -> Scores:
-        """Scores of all landmarks."""
-        return self.by({"all": True})["all"]
+        """Scores of all landmarks; a ValueError if no label is in view."""
+        if not (found := self.by({"all": True})):
+            raise ValueError("images: no label is in view; give images that show a labelled tool.")
+        return found["all"]
 
     @property
     def error_px(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lib import files
+from lib.correspondences import LANDMARKS
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
@@ -30,16 +31,27 @@ class LabelledImage(NamedTuple):
         return np.where((np.isfinite(self.u).all(1) & (self.visibility > 0))[:, None], self.u, np.nan)
 
 
-def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
-    """Yield the labelled left and right images of every `every`-th frame: by the truth of a simulation, else by annotations.
+def labelled_frames(recording: Recording) -> list[int]:
+    """Numbers of the frames with labels: all frames of a simulation, else those with an annotation in either view.
 
-    Images without annotations are skipped.  Raises ValueError if the recording has neither.
+    Raises ValueError if the recording has neither truth nor annotations, or other landmarks than the detector.
     """
-    if (labels := recording.truth or recording.annotations) is None:
+    if recording.skeleton != LANDMARKS:
+        what = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
+        raise ValueError(f"{recording.name}: {what}; give a recording of a forceps.")
+    if recording.truth:
+        return list(range(len(recording.frames)))
+    if (labels := recording.annotations) is None:
         raise ValueError(f"{recording.name}: it has neither truth/ nor annotations.json; give a labelled recording.")
-    for i in range(0, len(recording.frames), every):
+    return np.flatnonzero(labels.visibility_left.any(1) | labels.visibility_right.any(1)).tolist()
+
+
+def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
+    """Yield the left and right images of every `every`-th of the `labelled_frames`; those without annotations are skipped."""
+    labels = recording.truth or recording.annotations
+    for i in labelled_frames(recording)[::every]:
         marked = [side for side in ("left", "right") if recording.truth or getattr(labels, f"visibility_{side}")[i].any()]
-        frame = recording.frames[i] if marked else None
+        frame = recording.frames[i]
         for side in marked:
             u, visibility = getattr(labels, f"u_{side}")[i], getattr(labels, f"visibility_{side}")[i]
             if recording.truth is None:

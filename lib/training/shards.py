@@ -107,9 +107,14 @@ def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
         raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
 
 
+def shards_of(folder: str | Path, kind: str) -> list[Path]:
+    """The shards of a kind in a folder, in order, without the partial files that a killed process leaves."""
+    return sorted(Path(folder).glob(f"{kind}_[0-9][0-9][0-9][0-9].npz"))
+
+
 def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
     """Read and join the arrays of the (`first`) shards of a kind; errors name a missing, corrupt or differently sized one."""
-    if not (found := sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]):
+    if not (found := shards_of(folder, kind)[:first]):
         raise FileNotFoundError(f"{folder}: no shard {kind}_*.npz; make some with `python3 -m lib train generate`.")
     shards = [_read(path, names) for path in found]
     for path, shard in zip(found, shards, strict=True):
@@ -140,7 +145,7 @@ def packed(
 def read_scenes(folder: str | Path) -> tuple[np.ndarray, ...]:
     """Read all shards of scenes in a folder, as `packed` returns them."""
     parts = read_shards(folder, "scenes", ("jpegs", "u", "visibility"))
-    ends = (_read(path, ("jpeg_ends",))[0] for path in sorted(Path(folder).glob("scenes_*.npz")))
+    ends = (_read(path, ("jpeg_ends",))[0] for path in shards_of(folder, "scenes"))
     return np.cumsum(np.concatenate([np.diff(own, prepend=0) for own in ends])), *parts
 
 
@@ -149,7 +154,7 @@ def propose(folder: str | Path, detector: str | Path | None = None, *, workers: 
 
     Most are not tools: they are the most useful negatives for the second stage.  `detector` is as for `Detector.load`.
     """
-    jobs = {_proposals(path): (path, detector) for path in Path(folder).glob("scenes_*.npz")}
+    jobs = {_proposals(path): (path, detector) for path in shards_of(folder, "scenes")}
     for _, error in run_jobs(make_proposals, jobs, workers=workers, title="Searching scenes", unit="shard"):
         if error:
             raise error
@@ -179,7 +184,7 @@ def _proposals(scenes: Path) -> Path:
 def read_proposals(folder: str | Path) -> np.ndarray | None:
     """Read the proposals for a folder's scenes, (n, PROPOSALS, 3, 2) px; NaN for shards without, None if all are without."""
     known, parts = False, []
-    for path in sorted(Path(folder).glob("scenes_*.npz")):
+    for path in shards_of(folder, "scenes"):
         own, n = _proposals(path), len(_read(path, ("jpeg_ends",))[0])
         known |= own.is_file()
         parts.append(_read(own, ("u",))[0] if own.is_file() else np.full((n, PROPOSALS, 3, 2), np.nan))
@@ -190,7 +195,7 @@ def read_proposals(folder: str | Path) -> np.ndarray | None:
 
 def validation_images(folder: str | Path, kind: str = "held_out") -> Iterator[LabelledImage]:
     """Yield full frames that no training saw, for `lib.training.evaluation`; `kind` is ``"held_out"`` or ``"validation"``."""
-    for path in sorted(Path(folder).glob(f"{kind}_*.npz")):
+    for path in shards_of(folder, kind):
         jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):
             yield LabelledImage(f"{path.stem} {i}", cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB), u[i], visibility[i])

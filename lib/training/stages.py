@@ -28,7 +28,7 @@ from lib.training.drawings import drawn_ground
 from lib.training.error_models import fit_error_models
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, TrainingConfig, load_training, train
-from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_images
+from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_frames, labelled_images
 from lib.training.shards import validation_images
 from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
@@ -139,6 +139,7 @@ def finetune(
             stopped.set()
             raise
     added = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
+    added["trained_on"] = f"{detector.metadata.get('trained_on', 'images that nobody noted')}; then on labelled frames"
     tuned = replace(detector, **networks, metadata=detector.metadata | added)
     tuned = fit_error_models(tuned, [*held_out, *extra_held_out], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
@@ -169,6 +170,7 @@ def assemble(
     are lines for the card.  A missing stage is taken from `initial`.  Raises FileNotFoundError without it or without shards.
     """
     out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
     trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
     stages = {k: load_training(p) if p.exists() or not initial else training_of(initial, k) for k, p in trained.items()}
     if not (frames := list(validation_images(data))):
@@ -178,16 +180,17 @@ def assemble(
     grounds = (drawn_ground(one.image, rng) for one in frames[::8])
     bare = [LabelledImage(f"bare {i}", image, np.full((3, 2), np.nan), np.zeros(3)) for i, image in enumerate(grounds)]
     near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
-    opened = map(Recording.open, recordings)  # 16 images of each, spread over it
-    typical = [one for own in opened for one in labelled_images(own, every=max(1, len(own.frames) // 8))]
+    opened = map(Recording.open, recordings)  # the images of about 8 labelled frames of each, spread over it
+    typical = [one for own in opened for one in labelled_images(own, every=max(1, len(labelled_frames(own)) // 8))]
     networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0])
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
+    simulated = "simulated frames and flat drawings only (lib.simulator.population, lib.training.drawings); "
+    simulated += "no eye or tool of a shipped recording"
     provenance = {
-        "trained_on": "simulated frames and flat drawings only (lib.simulator.population, lib.training.drawings); "
-        "no eye or tool of a shipped recording",
+        "trained_on": initial.metadata.get("trained_on", simulated) if initial else simulated,
         "commit": commit_id(), "machine": machine(), "notes": list(notes),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames), "bare_frames": len(bare), "near_frames": len(near_by),
@@ -199,7 +202,6 @@ def assemble(
         },
     }  # fmt: skip
     detector = replace(detector, metadata=json.loads(json.dumps(provenance, default=float)))
-    out.parent.mkdir(parents=True, exist_ok=True)
     detector.save(out)
     write_text(out.with_name("README.md") if out.stem == "default" else out.with_suffix(".md"), card(detector, out))
     return detector

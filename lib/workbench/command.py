@@ -19,7 +19,7 @@ from pathlib import Path
 from tqdm.auto import tqdm
 
 from lib import files, paths
-from lib.parallel import cores
+from lib.parallel import cores, lives
 from lib.provenance import commit, machine
 from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
@@ -108,7 +108,10 @@ def run(
 
     try:
         paths.CACHE.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
+        for folder in paths.CACHE.glob("run-[0-9]*-*"):  # of runs that were killed
+            if not lives(int(folder.name.split("-")[1])):
+                shutil.rmtree(folder, ignore_errors=True)
+        with tempfile.TemporaryDirectory(prefix=f"run-{os.getpid()}-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
             os.environ[paths.SHARED_VARIABLE] = shared  # inherited by the kernels
             with ThreadPoolExecutor(jobs) as pool:
                 try:
@@ -147,7 +150,7 @@ def complete_runs(runs: Path) -> list[tuple[Path, dict]]:
     for file in runs.glob("*/metrics.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # written by another version, or cut off
             content = json.loads(file.read_text(encoding="utf-8"))
-            if (content["format"], content["state"]) == ("microstereo.metrics", "complete") and content["started"]:
+            if (content["format"], content["state"], type(content["started"])) == ("microstereo.metrics", "complete", str):
                 found.append((file.parent, content))
     return sorted(found, key=lambda run: run[1]["started"])
 
@@ -156,9 +159,10 @@ def previous_values(runs: Path, content: dict) -> dict[str, float | None]:
     """Metric -> its value in the last complete run that has it, on the machine and with the settings of `content`."""
     found = {}
     for _, other in complete_runs(runs):
-        alike = all(other[key] == content[key] for key in ("profile", "parameters"))
-        if alike and all(other["machine"][key] == content["machine"][key] for key in ("processor", "cores", "gpu")):
-            found |= {m["name"]: m["value"] for m in other["metrics"] if not pages.is_recorded(m)}
+        with contextlib.suppress(KeyError, TypeError):  # written by another version
+            alike = all(other[key] == content[key] for key in ("profile", "parameters"))
+            if alike and all(other["machine"][key] == content["machine"][key] for key in ("processor", "cores", "gpu")):
+                found |= {m["name"]: m["value"] for m in other["metrics"] if not pages.is_recorded(m)}
     return found
 
 

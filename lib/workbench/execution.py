@@ -59,6 +59,8 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
             there = [book.stem for book in shipped] + [f"studies/{book.stem}" for book in studies]
             raise ValueError(f"unknown notebook: {name}. There are: {', '.join(there)}.")
         chosen += [book for book in fits if book not in chosen]
+    if twice := [str(one) for one in chosen if [book.stem for book in chosen].count(one.stem) > 1]:
+        raise ValueError(f"{' and '.join(twice)}: a run has one page for each name; run them apart, or rename one.")
     return sorted(chosen, key=lambda book: book.name)
 
 
@@ -134,7 +136,7 @@ def _inspect(notebook: Path) -> dict[str, dict]:
     logging.getLogger("papermill").setLevel(logging.ERROR)  # no warnings about notebooks without a parameters cell
     try:
         return papermill.inspect_notebook(str(notebook))
-    except (OSError, ValueError, nbformat.ValidationError) as error:  # a ValueError if the text is not JSON
+    except (OSError, ValueError, TypeError, AttributeError, nbformat.ValidationError) as error:  # the first for other JSON
         raise ValueError(f"{notebook}: not a notebook ({error}).") from None
 
 

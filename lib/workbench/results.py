@@ -43,11 +43,11 @@ class Table:
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray | list[str]]:
-        """Name -> array of numbers or truth values (n,), or list of n texts; NaN or "" where a row has no entry."""
+        """Name -> array of numbers or truth values (n,), or list of n texts (also of lists); NaN or "" without an entry."""
         found: dict[str, np.ndarray | list[str]] = {}
         for name in dict.fromkeys(key for row in self.rows for key in row):
             values = [row.get(name) for row in self.rows]
-            if any(isinstance(value, str) and value for value in values):
+            if any(isinstance(value, str | list) and value for value in values):
                 found[name] = ["" if value is None or value != value else str(value) for value in values]
             else:
                 found[name] = np.array([math.nan if value in (None, "") else value for value in values])
@@ -70,7 +70,7 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
         provenance = json.loads(origin.read_text(encoding="utf-8")) if origin.is_file() else {}
     except ValueError as error:
         raise ValueError(f"{origin}: not JSON ({error}); restore it.") from error
-    with table.open(encoding="utf-8", newline="") as stream:
+    with table.open(encoding="utf-8-sig", newline="") as stream:  # a spreadsheet may have put a mark at the start
         names, *rows = [row for row in csv.reader(stream, strict=True) if row] or [[]]
     if odd := [number for number, row in enumerate(rows, start=2) if len(row) != len(names)]:
         raise ValueError(f"{table}: row {odd[0]} does not have {len(names)} entries; restore it.")

@@ -48,8 +48,9 @@ def test_a_flipped_bit_is_noticed_wherever_it_is(where, tmp_path):
     at = content.index(b"[5.0") + 1 if where == "metadata" else (8 + header + len(content)) // 2
     content[at] ^= 1
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"weights\.safetensors: damaged.*get the file again"):
-        Detector.load(path)
+    for kind in (FORMAT, "microstereo.training"):  # it is damaged, whatever it was to be
+        with pytest.raises(ValueError, match=r"weights\.safetensors: damaged.*get the file again"):
+            read_checkpoint(path, kind)
 
 
 def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
@@ -109,6 +110,8 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"weights\.safetensors: not saved \(No space left"):
         untrained(frame_px=32).save(path)
     assert [file.name for file in tmp_path.iterdir()] == ["weights.safetensors"] and path.read_bytes() == before
+    with pytest.raises(OSError, match=r"^.*a\.safetensors: not saved \(.*there is no folder"):
+        untrained().save(tmp_path / "nowhere" / "a.safetensors")
 
 
 def test_weights_of_another_network_are_named(tmp_path):

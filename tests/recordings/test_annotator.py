@@ -118,6 +118,25 @@ def test_what_others_wrote_stays(folder):
     assert labels(folder).u_left[0, 0].tolist() == [8, 8] and labels(folder).u_left[1, 2].tolist() == [1, 1]
 
 
+def test_an_entry_keeps_the_order_of_its_own_category(folder):
+    """Two categories name the same landmarks in different orders; the entries of another program may lack ids."""
+    names = ["tip_2", "tip_1", "base"]
+    content = {
+        "categories": [{"id": 1, "keypoints": names[::-1]}, {"id": 2, "keypoints": names}],
+        "images": [{"id": 7, "file_name": "left/000001.png"}],
+        "annotations": [{"image_id": 7, "category_id": 2, "keypoints": [1, 1, 2, 2, 2, 2, 3, 3, 1]}],
+    }
+    path = folder / "annotations.json"
+    path.write_text(json.dumps(content))
+    annotator = Annotator(Recording.open(folder))
+    annotator.mark("left", 1, "tip_1", (30, 31))
+    annotator.mark("right", 1, "base", (5, 5))
+    now = json.loads(path.read_text())["annotations"]
+    assert now[0]["keypoints"] == [1, 1, 2, 30, 31, 2, 3, 3, 1] and now[1]["category_id"] == 1
+    assert labels(folder).u_left[1].tolist() == [[3, 3], [30, 31], [1, 1]]
+    assert labels(folder).u_right[1, 0].tolist() == [5, 5]
+
+
 @pytest.mark.parametrize(
     ("mark", "told"),
     [(("left", 0, 0, 64, 1, 2), "outside"), (("up", 0, 0, 1, 1, 2), "'up'"), (("left", N, 0, 1, 1, 2), f"frame {N}"),

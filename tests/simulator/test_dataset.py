@@ -1,5 +1,6 @@
 """The data set's command: progress, parallel work, resuming after a kill, the same files for the same seed."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -105,6 +106,8 @@ def test_says_beforehand_how_long_and_how_large(tmp_path, monkeypatch, capsys):
 def test_another_data_set_in_the_folder_is_refused(made):
     with pytest.raises(ValueError, match="another data set"):
         make_dataset(made, **(OPTIONS | {"n_pairs": 4}))
+    with pytest.raises(ValueError, match="another data set"):
+        main(["--folder", str(made), *WORDS, "--seed", "1", "--dry-run"])
     main(["--folder", str(made), *WORDS])  # nothing left to make
 
 
@@ -118,13 +121,46 @@ def test_a_damaged_sequence_is_named_and_not_passed_over(made, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "words", [["--seed", "-1"], ["--duration", "nan"], ["--duration", "0"], ["--pairs", "0"], ["--folder", "{file}"]]
-)
-def test_wrong_values_end_with_a_message(words, tmp_path):
+    "words",
+    [["--seed", "-1"], ["--duration", "nan"], ["--duration", "0"], ["--pairs", "0"], ["--folder", "{file}"],
+     ["--shipped"], ["--shipped", "--rung", "near"], ["--rung", "near", "--dry-run"], ["--overwrite"]],
+)  # fmt: skip
+def test_wrong_values_end_with_a_message(words, tmp_path, monkeypatch):
     """Of argparse, or as an error that `python3 -m lib` tells in one line."""
+    monkeypatch.setattr(paths, "SHIPPED_RECORDING", tmp_path / "shipped")
+    monkeypatch.setattr(paths, "CACHE", tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises((SystemExit, OSError)):
         main(WORDS + [word.format(file=tmp_path / "file") for word in words])
+
+
+def test_two_runs_at_once_do_not_end_each_other(made, tmp_path, monkeypatch):
+    """The other run has made one sequence meanwhile and is writing another; a third run was killed."""
+    folder = shutil.copytree(made, tmp_path / "shared")
+    shutil.rmtree(folder / "train_01")
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    own, old = (folder / f"train_01.{pid}-a1b2c3.partial" for pid in (os.getpid(), ended.pid))
+    own.mkdir()
+    old.mkdir()
+
+    def late(function, jobs, **options):
+        yield folder / "train_00", FileExistsError("train_00: exists already")
+        yield folder / "train_01", ValueError("a fault of its own")
+
+    monkeypatch.setattr("lib.simulator.dataset.run_jobs", late)
+    with pytest.raises(ValueError, match="a fault of its own"):
+        make_dataset(folder, **OPTIONS)
+    assert own.exists() and not old.exists()
+
+
+def test_a_recording_with_a_shift_is_replaced_on_request(tmp_path):
+    words = ["--rung", "near", "--folder", str(tmp_path / "near"), *WORDS]
+    main(words)
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        main(words)
+    main([*words, "--pairs", "1", "--overwrite"])
+    assert len(Recording.open(tmp_path / "near")) == 1
 
 
 def finished(folder: Path) -> set[str]:

@@ -169,6 +169,7 @@ def test_training_never_draws_what_test_recordings_show():
         (lambda: Motion(Forceps(), EYE, duration_s=0), "duration_s"),
         (lambda: render_pair(EYE, SMALL, forceps=Forceps(), pose=Pose((50.0, 0.0, 0.0))), "outside the field"),
         (lambda: simulate("x", n_frames=0), "n_frames"),
+        (lambda: simulate("x", Design(EYE, duration_s=1.0), n_frames=27), "27 at 25 Hz last longer than the motion's 1 s"),
         (lambda: Design(dropout=1.0), "dropout"),
         (lambda: Design(click_px=-1.0), "click_px"),
         (lambda: Microscope(fps=0.0), "fps"),

@@ -11,12 +11,14 @@ import torch
 
 from lib import paths
 from lib.__main__ import COMMANDS
-from lib.landmarks import Detector
+from lib.landmarks import Detector, Landmarks
 from lib.landmarks.detector import CLOSE
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.recordings import Annotations, Recording
 from lib.training import command, stages
 from lib.training.command import main_evaluate
+from lib.training.evaluation import evaluate
 from lib.training.loop import load_training
 from lib.training.sources import FrameSource
 from tests.toys import toy_images
@@ -48,6 +50,10 @@ def test_the_evaluate_command(tmp_path, capsys, monkeypatch):
     assert main_evaluate([str(paths.SHIPPED_RECORDING), "--every", "20", "--json", str(out)]) == 0
     assert "PCK@0.05" in capsys.readouterr().out
     assert set(json.loads(out.read_text())) >= {"all", "base", "tip_1", "tip_2"}
+    alike = lambda shown: Landmarks(np.zeros((1, 3, 2)), np.full((1, 3, 2, 2), np.nan), np.ones((1, 3)))  # noqa: E731
+    monkeypatch.setattr(Detector, "load", classmethod(lambda cls, weights: alike))
+    assert main_evaluate([str(paths.SHIPPED_RECORDING), "--every", "20", "--json", str(out)]) == 0
+    assert json.loads(out.read_text())["all"]["nees"] is None
     assert COMMANDS["evaluate"]([str(tmp_path)]) == 2
     with pytest.raises(SystemExit):
         main_evaluate([str(paths.SHIPPED_RECORDING), "--json", str(tmp_path / "nowhere" / "scores.json")])
@@ -72,7 +78,8 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     images = toy_images(8, size=(270, 480))
     images[0] = images[0]._replace(u=np.full((3, 2), np.nan))
     hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
-    detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
+    metadata = {"trained_on": "toys"}
+    detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup, metadata=metadata)
     fitted_on, done = [], []
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
@@ -83,6 +90,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
     finetuned = tuned.metadata["finetuned"]
     assert (finetuned["images"], finetuned["held_out"]) == (5, 2)  # those with a base and a tip
+    assert tuned.metadata["trained_on"] == "toys; then on labelled frames"
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
     for stage, network in tuned.networks.items():
         provenance = load_training(tmp_path / stage / "last.safetensors").provenance
@@ -103,6 +111,31 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     assert kept.closeup_network is closeup and kept.tool_network is not hourglass  # held-out images prefer those from before
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
         stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
+
+
+def test_assembly_takes_labelled_frames_from_all_over_a_recording(tmp_path, monkeypatch):
+    """Labels in ten of the 34 frames; networks, renderer and fits are replaced by stand-ins."""
+    images, fitted_on = toy_images(8), []
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    seen = np.zeros((len(recording), 3), int)
+    seen[[1, 2, 3, 5, 9, 14, 21, 22, 23, 33]] = 2
+    labels = Annotations(*np.full((2, len(recording), 3, 2), 40.0), seen, 0 * seen)
+    monkeypatch.setattr(Recording, "open", lambda folder: replace(recording, truth=None, annotations=labels))
+    monkeypatch.setattr(stages, "validation_images", lambda data: images)
+    monkeypatch.setattr(stages, "sample", lambda rng, **options: images[0][1:])
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, shown, **options: fitted_on.extend(shown) or d)
+    missed = lambda shown: Landmarks.none(len(shown))  # noqa: E731
+    monkeypatch.setattr(stages, "evaluate", lambda d, shown, progress: evaluate(missed, shown))
+    monkeypatch.setattr(stages, "card", lambda detector, path: "")
+    monkeypatch.setattr(Detector, "save", lambda detector, path: None)
+    hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
+    metadata = {"trained_on": "toys; then on labelled frames"}
+    initial = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup, metadata=metadata)
+    rest = {"recordings": [Path("ours")], "initial": initial}
+    made = stages.assemble(tmp_path, tmp_path, tmp_path / "made.safetensors", **rest)
+    names = [one.name for one in fitted_on if one.name.startswith("left")]
+    assert names == [f"left {i}" for i in (1, 2, 3, 5, 9, 14, 21, 22, 23, 33)] and made.metadata["recorded_frames"] == 10
+    assert made.metadata["trained_on"] == "toys; then on labelled frames"
 
 
 def test_time_ends_fine_tuning(tmp_path, monkeypatch):
@@ -131,6 +164,24 @@ def test_a_stopped_fine_tuning_stops_all_stages(tmp_path, monkeypatch):
         stages.finetune(detector, images[:2], images[2:], tmp_path, steps=10**6, progress=stop)
 
 
-def test_fine_tuning_needs_recordings_and_a_file(capsys):
+def test_fine_tuning_needs_recordings_and_a_file(tmp_path, monkeypatch, capsys):
     assert COMMANDS["train"](["finetune"]) == 2
     assert "--out" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(command, "finetune", None)  # it does not come to that
+    out = tmp_path / "file" / "a.safetensors"
+    assert COMMANDS["train"](["finetune", str(paths.SHIPPED_RECORDING), "--out", str(out)]) == 2
+    assert "file" in capsys.readouterr().err
+
+
+def test_both_views_of_a_frame_are_held_out(tmp_path, monkeypatch, capsys):
+    images = [toy_images(1)[0]._replace(name=f"{side} {i}") for i in (3, 4, 7) for side in ("left", "right")]
+    parts, tuned = [], SimpleNamespace(save=lambda path: None)
+    scores = SimpleNamespace(pck_0_05=0.0, median_px=0.0)
+    monkeypatch.setattr(command, "labelled_images", lambda recording, every: images[:-1])  # the cut is within frame 4
+    monkeypatch.setattr(command, "finetune", lambda detector, *split, **options: parts.extend(split[:2]) or tuned)
+    monkeypatch.setattr(command, "evaluate", lambda *_: SimpleNamespace(scores=scores))
+    monkeypatch.setattr(command.Detector, "load", lambda path: None)
+    out = tmp_path / "new" / "a.safetensors"
+    command.main(["finetune", str(paths.SHIPPED_RECORDING), "--out", str(out), "--data", str(tmp_path)])
+    assert [one.name for one in parts[0]] == ["left 3", "right 3"] and len(parts[1]) == 3 and out.parent.is_dir()

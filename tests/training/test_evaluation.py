@@ -84,6 +84,10 @@ def test_groups_have_their_own_scores():
 def test_nothing_to_evaluate_is_named():
     with pytest.raises(ValueError, match="images: no labelled image"):
         evaluate(off_by(0.0), [])
+    absent = evaluate(off_by(0.0), [one._replace(visibility=np.zeros(3)) for one in IMAGES])
+    assert absent.detection()["in_view_precision"] == 0
+    with pytest.raises(ValueError, match="images: no label is in view"):
+        absent.scores  # noqa: B018
 
 
 def test_labels_are_the_truth_or_else_the_annotations():
@@ -101,3 +105,8 @@ def test_labels_are_the_truth_or_else_the_annotations():
     assert [one.name for one in marked] == ["right 0"]  # what nobody marked is not read
     with pytest.raises(ValueError, match=r"neither truth/ nor annotations\.json"):
         next(iter(labelled_images(replace(recording, truth=None, annotations=None))))
+    annotations.visibility_left[[3, 9, 20, 33]] = 2
+    sparse = labelled_images(replace(recording, truth=None, annotations=annotations), every=2)
+    assert [one.name for one in sparse] == ["right 0", "left 9", "left 33"]  # every second of those that are labelled
+    with pytest.raises(ValueError, match=r"the recording has \['shaft', 'elbow', 'hook'\]; give a recording of a forceps"):
+        next(iter(labelled_images(replace(recording, skeleton=("shaft", "elbow", "hook")))))

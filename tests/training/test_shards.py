@@ -85,9 +85,12 @@ def test_proposals_are_found_once_and_missing_ones_are_nan(monkeypatch, tmp_path
     monkeypatch.setattr(shards.Detector, "load", lambda name: Proposing())
     image = LabelledImage("a", np.full((90, 160, 3), 90, np.uint8), np.full((3, 2), 40.0), np.full(3, 2))
     assert shards.read_proposals(tmp_path) is None
+    for kind in ("scenes", "proposals", "held_out"):  # of a killed process
+        (tmp_path / f"{kind}_0001.4711.partial.npz").write_bytes(b"half")
     for number in range(2):
         ends, jpegs, u, visibility = shards.packed([image] * 3)
         np.savez(tmp_path / f"scenes_{number:04d}.npz", jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
+    assert len(shards.read_scenes(tmp_path)[0]) == 6 and list(shards.validation_images(tmp_path)) == []
     shards.make_proposals(tmp_path / "proposals_0001.npz", tmp_path / "scenes_0001.npz", None)
     found = shards.read_proposals(tmp_path)
     assert found.shape == (6, shards.PROPOSALS, 3, 2) and np.isnan(found[:3]).all()

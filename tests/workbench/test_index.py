@@ -150,6 +150,13 @@ def test_the_previous_run_is_of_this_machine_profile_and_parameters(tmp_path):
         content = now | {"format": "microstereo.metrics", "state": "complete", "started": "2026-01-01"}
         content |= {"metrics": [metric("a_px", value)]} | changed
         (tmp_path / name / "metrics.json").write_text(json.dumps(content), encoding="utf-8")
+        if name == "2":
+            newest = content | {"started": "2026-01-05"}
+    other = {"7": newest | {"started": 5}, "8": newest | {"metrics": [{"title": "a"}]}, "9": newest | {"machine": None},
+             "10": {key: value for key, value in newest.items() if key != "machine"}}  # fmt: skip
+    for name, content in other.items():  # of other versions
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.json").write_text(json.dumps(content), encoding="utf-8")
     (tmp_path / "6").mkdir()
     (tmp_path / "6" / "metrics.json").write_text("{", encoding="utf-8")
     assert previous_values(tmp_path, now) == {"a_px": 2.0}

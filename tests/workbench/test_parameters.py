@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shutil
 
 import papermill
 import pytest
@@ -22,7 +23,7 @@ def books(write_notebook, tmp_path_factory):
     return folder
 
 
-def test_notebooks_are_chosen_by_number_name_or_path(books):
+def test_notebooks_are_chosen_by_number_name_or_path(books, tmp_path):
     assert [book.stem for book in choose_notebooks([], books)] == ["00_error", "02_dead", "03_good"]
     assert [book.stem for book in choose_notebooks(["03", "00_error", "00"], books)] == ["00_error", "03_good"]
     assert choose_notebooks([str(books / "03_good.ipynb")], books) == [(books / "03_good.ipynb").resolve()]
@@ -30,6 +31,9 @@ def test_notebooks_are_chosen_by_number_name_or_path(books):
         assert choose_notebooks([name], books) == [books / "studies" / "noise.ipynb"]
     with pytest.raises(ValueError, match="unknown notebook: 3. There are: 00_error"):
         choose_notebooks(["3"], books)
+    mine = shutil.copy(books / "03_good.ipynb", tmp_path)
+    with pytest.raises(ValueError, match=r"03_good.ipynb and .*03_good.ipynb: a run has one page for each name"):
+        choose_notebooks([str(mine), "03"], books)
 
 
 def test_values_take_the_declared_type(books):
@@ -76,8 +80,9 @@ seed: int = 0  # drives all
     assert declared_grid(study) == {"frames": ["75", "300", "1500"], "sizes": ["[1, 2]", "[3]"]}
 
 
-def test_a_notebook_that_is_no_json(tmp_path):
-    (tmp_path / "torn.ipynb").write_text('{"cells": [', encoding="utf-8")
+@pytest.mark.parametrize("text", ['{"cells": [', "[]", "5", '{"cells": 3}', '{"nbformat": 4, "metadata": {}, "cells": [3]}'])
+def test_a_notebook_that_is_no_notebook(text, tmp_path):
+    (tmp_path / "torn.ipynb").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match="torn.ipynb: not a notebook"):
         declared_grid(tmp_path / "torn.ipynb")
 

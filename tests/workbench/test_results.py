@@ -34,6 +34,17 @@ def test_a_table_comes_back(tmp_path):
     assert results.read("matching", tmp_path).provenance == {"times_recorded": 2}  # so often was a test set opened
 
 
+def test_lists_are_texts_before_and_after_a_file(tmp_path):
+    rows = [{"sizes": sizes, "error_um": 1.0} for sizes in ([1, 2], [3], None)]
+    results.write("sizes", rows, {}, tmp_path)
+    assert results.Table(rows).columns["sizes"] == ["[1, 2]", "[3]", ""] == results.read("sizes", tmp_path).columns["sizes"]
+
+
+def test_a_mark_of_a_spreadsheet_is_no_part_of_a_name(tmp_path):
+    (tmp_path / "saved.csv").write_text("seed,error_um\n0,1\n", encoding="utf-8-sig")
+    assert results.read("saved", tmp_path).rows == [{"seed": 0, "error_um": 1}]
+
+
 def test_what_is_missing_or_damaged(tmp_path):
     assert results.read("none", tmp_path) is None
     (tmp_path / "torn.csv").write_text("a,b\n1,2\n3")

@@ -312,11 +312,12 @@ def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_pa
     assert content["state"] == "failed" and "No space left" in content["notebooks"][0]["failure"]["message"]
 
 
-def test_a_killed_run_leaves_a_report_and_the_next_its_own(books, without_kernels, tmp_path):
+def test_a_killed_run_leaves_a_report_and_the_next_its_own(books, without_kernels, tmp_path, monkeypatch):
     """kill -9 while the second of two notebooks runs, as soon as metrics.json says so: the page says it too."""
     code = """
 import shutil, sys, time
 from pathlib import Path
+from lib import paths
 from lib.workbench import command
 
 def execute(book, output, values, **options):
@@ -327,21 +328,26 @@ def slow_page(content, page=command.pages.index_html):
     time.sleep(0.3)
     return page(content)
 
-command.execute, command.pages.index_html = execute, slow_page
+command.execute, command.pages.index_html, paths.CACHE = execute, slow_page, Path(sys.argv[3])
 command.run(["00", "02"], runs=Path(sys.argv[1]), notebooks=Path(sys.argv[2]))
 """
-    words = [sys.executable, "-c", code, str(tmp_path), str(books)]
+    runs, cache = tmp_path / "runs", tmp_path / "cache"
+    words = [sys.executable, "-c", code, str(runs), str(books), str(cache)]
     process = subprocess.Popen(words, cwd=paths.ROOT, stdout=subprocess.DEVNULL)
     states: list[str] = []
     while states != ["complete", "running"]:
         assert process.poll() is None
         time.sleep(0.05)
-        for file in tmp_path.glob("*/metrics.json"):
+        for file in runs.glob("*/metrics.json"):
             states = [book["state"] for book in json.loads(file.read_text(encoding="utf-8"))["notebooks"]]
     process.kill()
     process.wait()
-    assert run(["00"], runs=tmp_path, notebooks=books)["state"] == "complete"
-    first, second = sorted(tmp_path.iterdir(), key=lambda folder: len(folder.name))
+    (cache / f"run-{os.getpid()}-other").mkdir()
+    assert len(list(cache.iterdir())) == 2
+    monkeypatch.setattr(paths, "CACHE", cache)
+    assert run(["00"], runs=runs, notebooks=books)["state"] == "complete"
+    assert [folder.name for folder in cache.iterdir()] == [f"run-{os.getpid()}-other"], "that of a run that goes on"
+    first, second = sorted(runs.iterdir(), key=lambda folder: len(folder.name))
     assert second.name == f"{first.name}-2"
     assert json.loads((first / "metrics.json").read_text(encoding="utf-8"))["state"] == "running"
     assert "00_error.html" in (first / "index.html").read_text(encoding="utf-8")

@@ -153,6 +153,8 @@ def test_plots(tmp_path):
     save_plots(rows, ["seed", "n", "method"], tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["error_um.png"]
     assert (tmp_path / "error_um.png").read_bytes().startswith(b"\x89PNG")
+    save_plots([{"sizes": sizes, "depth_um": 1.0} for sizes in ([1, 2], [3])], ["sizes"], tmp_path)
+    assert (tmp_path / "depth_um.png").is_file()
 
 
 @pytest.mark.slow
