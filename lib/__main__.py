@@ -127,7 +127,8 @@ def _keep_detections() -> None:
     """Name the folder in which `SharedDetector` keeps detections for later commands; other detector code has its own."""
     from lib import files, paths
 
-    folder = paths.CACHE / "detections" / files.digest(*sorted((ROOT / "lib" / "landmarks").glob("*.py")))
+    code = [*sorted((ROOT / "lib" / "landmarks").glob("*.py")), ROOT / "lib" / "recordings" / "ground.py"]
+    folder = paths.CACHE / "detections" / files.digest(*code)
     with contextlib.suppress(OSError):  # on a full disk detections are not kept
         folder.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault(paths.SHARED_VARIABLE, str(folder))

@@ -120,7 +120,8 @@ def look_elsewhere(
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
     """A copy of `seen`; tools that are `still` (m, 2) are detected again, only where images differ from the ground."""
-    found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
+    images = np.argwhere(still if recording.ground is not None else np.zeros_like(still))
+    found = Seen(*(part.copy() for part in seen))
     for k, (i, side) in enumerate(images):
         frame = recording.frames[int(seen.frame[i])]
         other = detector(levelled((frame.left, frame.right)[side], recording.ground()[side])[None])

@@ -10,6 +10,7 @@ _TILES, _LIMIT = 8, 2.0
 _SMOOTHING, _DIFFERENCE_PERCENTILE, _TARGET_DIFFERENCE, _GAIN_RANGE = 1e-3, 99.5, 80.0, (1.0, 4.0)
 #: `stretched`: the percentiles that become black and white.  Percentiles are estimated on every `_STEP`-th row and column.
 _STRETCH_PERCENTILES, _STEP = (1.0, 99.0), 4
+_DARK = 8  # grey value up to which a pixel of the ground may belong to the black surround of a round field
 
 
 def equalised(image: np.ndarray) -> np.ndarray:
@@ -49,10 +50,13 @@ def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """
     if image.shape != ground.shape:
         raise ValueError(f"ground: expected {image.shape}, the same as the image, got {ground.shape}.")
-    thinned = (part[::_STEP, ::_STEP] + 1.0 for part in (image, ground))
-    ground = cv2.multiply(ground, (*np.median(np.divide(*thinned), axis=(0, 1)), 0.0))
+    lit = ground[::_STEP, ::_STEP].max(axis=2) > _DARK  # a black surround tells nothing of the light
+    lit = lit if lit.any() else ~lit
+    thinned = (part[::_STEP, ::_STEP][lit] + 1.0 for part in (image, ground))
+    ground = cv2.multiply(ground, (*np.median(np.divide(*thinned), axis=0), 0.0))
     difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTHING * max(image.shape))
-    largest = np.percentile(np.abs(difference[::_STEP, ::_STEP]).max(axis=2), _DIFFERENCE_PERCENTILE)
+    largest = np.percentile(np.abs(difference[::_STEP, ::_STEP][lit]).max(axis=1), _DIFFERENCE_PERCENTILE)
     gain = float(np.clip(_TARGET_DIFFERENCE / max(largest, 1.0), *_GAIN_RANGE))
     # OpenCV clips at 0 and 255.
-    return cv2.addWeighted(difference, gain, np.full_like(difference, ground.mean(axis=(0, 1))), 1.0, 0.0, dtype=cv2.CV_8U)
+    mean = np.full_like(difference, ground[::_STEP, ::_STEP][lit].mean(axis=0))
+    return cv2.addWeighted(difference, gain, mean, 1.0, 0.0, dtype=cv2.CV_8U)

@@ -6,7 +6,8 @@ resized.  All other stages but ``tracking`` also take ``rough_u`` (n, 3, 2), the
 their own input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``closeup``,
 ``closer`` and ``tracking`` see a window of one landmark; of their output use only the row of that landmark.  ``closeup``
 corrects the landmarks of the previous stage unless it is unsure, ``closer`` those that ``closeup`` moved far
-(`windows.moved_far`), ``tracking`` those of the previous frame.  Stages that share a network differ in their error models.
+(`windows.moved_far`), ``tracking`` those of the previous frame.  A closeup's confidence is 0 if its landmark lies beyond its
+reach, and unsure below 0.05.  Stages that share a network differ in their error models.
 """
 
 import importlib.util
@@ -52,6 +53,8 @@ class StageWithDecoding(nn.Module):
         else:
             peaks = decode(output, self.config.stride, method=self.method)
         covariance, confidence = covariance_and_confidence(peaks, Rough.of(*rough) if rough else None, self.fit)
+        if self.closeup:  # beyond the reach of a closeup nothing is found
+            confidence = confidence * peaks.value
         stride = self.stride.to(peaks.u.dtype)
         return peaks.u * stride + (stride - 1) / 2, covariance * (stride[:, None] * stride), confidence
 

@@ -265,7 +265,7 @@ def as_uint8(images: ArrayLike) -> np.ndarray:
     if array.dtype == np.uint8:
         return array
     if not np.issubdtype(array.dtype, np.floating):
-        raise ValueError(f"images: expected uint8 or float, got {array.dtype}; convert with astype(np.uint8).")
+        raise ValueError(f"images: expected uint8 or float, got {array.dtype}; divide by the largest value.")
     low, high = float(array.min()), float(array.max())
     if not (low >= 0.0 and high <= 1.0):
         raise ValueError(f"images: float images must lie in [0, 1], got {low:g} to {high:g}; divide by 255?")

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -47,14 +48,14 @@ def detect(
 
 
 def with_ground(detector: Callable, recording: Recording | GrowingGround, change: Callable | None = None) -> dict:
-    """Keyword arguments of a detector's call: the ground of the images.  Empty for a function that takes images alone.
+    """Keyword arguments of a detector's call: the ground of the images, if known.  Empty for a function of images alone.
 
     `change` is the function that made the images from those of the recording; the ground is changed likewise.
 
     >>> with_ground(lambda images: Landmarks.none(len(images)), None)
     {}
     """
-    if not isinstance(detector, Detector | SharedDetector):
+    if not isinstance(detector, Detector | SharedDetector) or recording.ground is None:
         return {}
     return {"ground": recording.ground.changed(change) if change else recording.ground}
 
@@ -87,10 +88,10 @@ class SharedDetector:
         if self._folder:
             content = f"{self._digest} {images.dtype} {images.shape} {ground and ground.key}".encode() + images.tobytes()
             file = Path(self._folder) / f"{files.digest(content, length=64)}.npz"
-            if file.is_file():
-                with np.load(file) as cached:
-                    self.read, self.seconds = self.read + 1, self.seconds + float(cached["seconds"])
-                    return Landmarks(cached["u"], cached["covariance"], cached["confidence"])
+            with suppress(OSError, ValueError, EOFError, KeyError, BadZipFile), np.load(file) as cached:  # else detect again
+                found, seconds = Landmarks(cached["u"], cached["covariance"], cached["confidence"]), float(cached["seconds"])
+                self.read, self.seconds = self.read + 1, self.seconds + seconds
+                return found
         start = time.perf_counter()
         found = self.detector(images, **({"ground": ground} if isinstance(self.detector, Detector) else {}))
         seconds = time.perf_counter() - start

@@ -8,6 +8,7 @@ import numpy as np
 
 _FRAMES = 9  # number of frames in the median; more take longer and hardly improve it
 _FEWEST = 5  # with fewer frames the tool may cover a place in most of them
+_APART = 0.5  # least distance between the tool's places in two of these frames, in units of its length
 
 
 class Ground:
@@ -27,13 +28,16 @@ class Ground:
         return self._see()
 
     @classmethod
-    def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self:
+    def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self | None:
         """The median of those frames of a recording (`name`) between which the robot's tool x_mm (n, k, 3) moves farthest.
 
-        If the robot reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred,
-        and a tool at rest becomes part of the ground, so a detector must also search the frame itself.
+        If the robot reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred.
+        None if fewer than five frames show the tool in different places: it would become part of the ground, and its place
+        would then look like a tool in frames that do not show it there.
         """
-        chosen = apart(x_mm.mean(axis=1), _FRAMES)
+        chosen = apart(x_mm.mean(axis=1), _FRAMES, _APART * _length(x_mm))
+        if len(chosen) < _FEWEST:
+            return None
 
         def see() -> np.ndarray:
             sides = ([getattr(frames[int(i)], side) for i in chosen] for side in ("left", "right"))
@@ -58,13 +62,14 @@ class GrowingGround:
 
     def __init__(self) -> None:
         self._kept: list[np.ndarray] = []
-        self._centre_mm = np.empty((0, 3))
+        self._centre_mm, self._length_mm = np.empty((0, 3)), 0.0
         self.ground: Ground | None = None
 
     def take(self, images: np.ndarray, x_mm: np.ndarray) -> None:
         """Add a stereo frame (2, h, w, 3) uint8, which is copied if it is kept, and the robot's landmarks (k, 3) mm."""
         centre_mm, new = np.vstack([self._centre_mm, x_mm.mean(axis=0)]), len(self._kept)
-        chosen = apart(centre_mm, _FRAMES)
+        self._length_mm = np.fmax(self._length_mm, _length(x_mm[None]))
+        chosen = apart(centre_mm, _FRAMES, _APART * self._length_mm)
         if new not in chosen or np.isnan(centre_mm[new]).any():
             return
         self._kept, self._centre_mm = [images.copy() if i == new else self._kept[i] for i in chosen], centre_mm[chosen]
@@ -80,10 +85,16 @@ def _median(images: Sequence[np.ndarray]) -> np.ndarray:
     return ranked[middle]
 
 
-def apart(x: np.ndarray, count: int) -> np.ndarray:
+def _length(x_mm: np.ndarray) -> float:
+    """The largest distance of a landmark from the first one of the tool, x_mm (n, k, 3), in the usual frame; 0 if unknown."""
+    size = np.linalg.norm(x_mm - x_mm[:, :1], axis=2).max(axis=1)
+    return float(np.median(size[np.isfinite(size)])) if np.isfinite(size).any() else 0.0
+
+
+def apart(x: np.ndarray, count: int, least: float = 0.0) -> np.ndarray:
     """Ascending indices of at most `count` points x (n, d), each the farthest from those chosen before; NaN is no point.
 
-    If fewer than three points are known, the indices are evenly spaced.
+    If fewer than three points are known, the indices are evenly spaced.  Points nearer than `least` are not chosen.
 
     >>> apart(np.array([[0.0], [1.0], [2.0], [np.nan], [9.0]]), 3)
     array([0, 2, 4])
@@ -94,5 +105,7 @@ def apart(x: np.ndarray, count: int) -> np.ndarray:
     chosen, distance = [known[0]], np.full(len(known), np.inf)
     while len(chosen) < min(count, len(known)):
         distance = np.minimum(distance, np.linalg.norm(x[known] - x[chosen[-1]], axis=1))
+        if distance.max() < least:
+            break
         chosen.append(known[distance.argmax()])
     return np.unique(chosen)

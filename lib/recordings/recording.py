@@ -233,8 +233,11 @@ class Recording:
         return part
 
     @cached_property
-    def ground(self) -> Ground:
-        """The images behind the tool, with sizes and dates of the files as key.  A detector in doubt uses them."""
+    def ground(self) -> Ground | None:
+        """The images behind the tool, with sizes and dates of the files as key; None if the tool hardly moves.
+
+        A detector in doubt uses them.
+        """
         files = [path for name in ("left*", "right*", "left/*", "right/*") for path in sorted(self.folder.glob(name))]
         changed = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.is_file()]
         return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {changed}")

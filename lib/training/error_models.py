@@ -135,7 +135,7 @@ def seen_by(
     # A stage that only guides the next one is correct if the next one can find the landmark there.
     share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
     tolerance, label_sd = np.repeat(share * tool_length_px(labelled.u), 3), np.broadcast_to(labelled.sd_px, 3)
-    known = np.isfinite(labels).all(1) | (labelled.visibility == 0)
+    known = (np.isfinite(labels).all(1) & np.isfinite(tolerance)) | (labelled.visibility == 0)
     if stage == "frame":
         peaks, stride = detector.frame_peaks(image), detector.frame_stride(image)
         errors = peaks.u[0].double().numpy() - cell_from_image(labels, stride)

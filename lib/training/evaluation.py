@@ -55,8 +55,11 @@ class Evaluation(NamedTuple):
 
     @property
     def confidence_error(self) -> float:
-        """Calibration error of the confidence as the probability of `correct`; a landmark out of view is never correct."""
-        known = np.isfinite(self.u_true).all(2) | (self.visibility == 0)
+        """Calibration error of the confidence as the probability of `correct`; a landmark out of view is never correct.
+
+        Images whose labels do not show the tool's length do not count.
+        """
+        known = (np.isfinite(self.u_true).all(2) & np.isfinite(self.length_px)[:, None]) | (self.visibility == 0)
         return calibration_error(self.landmarks.confidence[known], self.correct[known])
 
     def by(self, groups: Mapping[str, np.ndarray | bool]) -> dict[str, Scores]:

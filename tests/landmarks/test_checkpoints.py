@@ -24,6 +24,10 @@ def untrained(frame_px=64):
 def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
         Detector.load(tmp_path / "nothing.safetensors")
+    with pytest.raises(FileNotFoundError, match=r"nowhere.default"):
+        Detector.load(tmp_path / "nowhere" / "default")  # not the one that ships
+    with pytest.raises(ValueError, match=r"it is a folder; give the \.safetensors file in it"):
+        Detector.load(tmp_path)
     corrupt = tmp_path / "corrupt.safetensors"
     untrained().save(corrupt)
     corrupt.write_bytes(corrupt.read_bytes()[:-100])

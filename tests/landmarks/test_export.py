@@ -1,5 +1,6 @@
 """ONNX files hold network, decoding and error model; together they are the detector."""
 
+import copy
 import importlib.util
 from dataclasses import replace
 from functools import cache
@@ -12,7 +13,7 @@ from lib.landmarks import Detector, Landmarks
 from lib.landmarks import export as module
 from lib.landmarks.engines import openvino
 from lib.landmarks.error_model import ErrorModel
-from lib.landmarks.export import LARGEST, export
+from lib.landmarks.export import LARGEST, StageWithDecoding, export
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
 from lib.landmarks.windows import map_points
 from lib.parallel import single_threaded_torch
@@ -94,6 +95,16 @@ def test_every_exported_stage_is_that_of_the_detector(small, tmp_path, quick):
     detector, images = small
     with single_threaded_torch():  # the same bits every time: a last digit can move a window by OpenCV's 1/32 px
         check_every_stage(detector, np.concatenate([images, images[:1]]), tmp_path)
+
+
+def test_what_lies_beyond_the_reach_of_a_closeup_is_not_found(small):
+    detector = replace(small[0], closeup_network=copy.deepcopy(small[0].closeup_network))
+    windows = torch.from_numpy(np.random.default_rng(1).random((4, 3, 32, 32), dtype=np.float32))
+    for far_px in (0.0, 500.0):
+        with torch.no_grad():
+            detector.closeup_network.head[-1].bias[0] += far_px
+            confidence = StageWithDecoding(detector, "tracking", np.ones(2))(windows)[2]
+        assert bool((confidence == 0).all()) == (far_px > 0)
 
 
 @pytest.mark.slow

@@ -55,6 +55,15 @@ def test_another_image_or_ground_or_detector_is_looked_at_anew(shared, change):
     assert again(other, ground=ground).u[0, 0, 0] == 5.0 and again.read == 0
 
 
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", bytes(200)])
+def test_a_damaged_file_is_detected_anew(shared, content):
+    SharedDetector(Counting())(PAIR)
+    next(shared.glob("*.npz")).write_bytes(content)
+    again = SharedDetector(Counting(x=5.0))
+    assert again(PAIR).u[0, 0, 0] == 5.0 and again.read == 0
+    assert SharedDetector(Counting())(PAIR).u[0, 0, 0] == 5.0  # the file is whole again
+
+
 def test_outside_a_run_nothing_is_kept(monkeypatch, tmp_path):
     monkeypatch.delenv(paths.SHARED_VARIABLE, raising=False)
     detector = SharedDetector(Counting())

@@ -122,6 +122,18 @@ def test_a_tool_that_is_part_of_the_ground_is_not_found_but_the_other_one_is(shi
         levelled(both, shipped.ground[0])
 
 
+@pytest.mark.parametrize("light", [0.75, 1.25])
+def test_a_black_surround_does_not_hide_the_light_of_a_frame(shipped, light):
+    """A round field: more than half of the pixels are black whatever the light."""
+    y, x = np.indices(shipped.ground.shape[1:3]) - np.reshape(shipped.ground.shape[1:3], (2, 1, 1)) / 2
+    inside = (np.hypot(x, y) < 500)[..., None]
+    ground, image = (np.where(inside, one[0], 0).astype(np.uint8) for one in (shipped.ground, shipped.images))
+    lit = np.clip(np.where(inside, light * image.astype(float), 0), 0, 255).astype(np.uint8)
+    as_usual, changed = levelled(image, ground).astype(float), levelled(lit, ground).astype(float)
+    r = [one[inside[..., 0]].ravel() for one in (as_usual, changed)]
+    assert np.corrcoef(*r)[0, 1] > 0.95 and abs(r[0].mean() * light - r[1].mean()) < 10
+
+
 def test_where_there_is_doubt_what_differs_from_the_ground_decides(shipped):
     """Without colour some frames leave doubt, and something else is taken for the tool.  The ground is asked for in doubt."""
     images, ground = (

@@ -37,6 +37,20 @@ def test_a_long_rest_does_not_put_the_tool_into_it():
     assert (Ground.of_frames(frames(places), x_mm, "one")() != GROUND).any()
 
 
+def test_a_tool_that_hardly_moves_has_no_ground():
+    """It rests at two places: in the median of such frames it is seen where the other frames do not show it."""
+    rng, places = np.random.default_rng(0), np.array([[0, 0]] * 10 + [[20, 10]] * 8)
+    tool_mm = np.array([[0.0, 0, 0], [8, 1, 0], [8, -1, 0]])
+    x_mm = np.column_stack([places, np.zeros(18)])[:, None] + tool_mm
+    x_mm = x_mm + rng.normal(0, 0.01, x_mm.shape)
+    assert Ground.of_frames(frames(places), x_mm, "one") is None
+    growing = GrowingGround()
+    for frame, x in zip(frames(places), x_mm, strict=True):
+        growing.take(np.stack([frame.left, frame.right]), x)
+    assert growing.ground is None
+    assert Ground.of_frames(frames(places[:2]), np.full((2, 3, 3), np.nan), "one") is None  # of two frames
+
+
 def test_it_grows_with_the_frames_and_a_rest_at_their_end_does_not_put_the_tool_into_it():
     growing, places = GrowingGround(), [*np.column_stack([np.arange(0, 27, 3), np.tile([0, 11, 22], 3)]), *[[24, 22]] * 30]
     for k, (frame, place) in enumerate(zip(frames(places), places, strict=True)):

@@ -53,6 +53,18 @@ def test_only_labels_in_view_count():
     assert list(result.by_landmark()) == ["base", "tip_1"]
 
 
+def test_tips_without_a_base_say_nothing_of_the_confidence():
+    """Without the tool's length nobody knows whether they are near enough."""
+    tips = [image._replace(u=np.where(np.arange(3)[:, None] > 0, image.u, np.nan)) for image in IMAGES[:3]]
+    labels = iter([*IMAGES[:3], *IMAGES[3:]])
+
+    def detect(images: np.ndarray) -> Landmarks:
+        u = next(labels).u[None]
+        return Landmarks(u, np.broadcast_to(np.eye(2), (1, 3, 2, 2)).copy(), np.ones((1, 3)))
+
+    assert evaluate(detect, [*tips, *IMAGES[3:]]).confidence_error == pytest.approx(0.0)
+
+
 def test_precision_and_recall_of_detections():
     images = [image._replace(visibility=np.array([2, 1, 0])) for image in IMAGES]
     said = evaluate(off_by(1.0), images).detection()
