@@ -10,7 +10,7 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio
-from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
+from lib.matching.descriptors import CHANNELS, PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import Rectification, on_image, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
@@ -134,15 +134,15 @@ def _descriptors(
 def _match(
     left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True
 ) -> tuple[VolumeMatches, torch.Tensor]:
-    """Matches of two grids, except those on flat or mostly masked patches or without a peak; and the correlation volume."""
+    """Matches of two grids, except those on flat or partly masked patches or without a peak; and the correlation volume."""
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), off_line)
         matches = match_volume(volume, low, reciprocal=reciprocal)
     x, y = matches.patch.T
     start = matches.cell - (low, -off_line) + matches.patch * PATCH
     cells = np.ndindex(PATCH, PATCH)
-    seen_right = np.mean([right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r, c in cells], axis=0)
-    return matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked), volume
+    seen_right = np.all([right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r, c in cells], axis=0)
+    return matches.keep(patch_quality(left)[y, x] & seen_right & matches.peaked), volume
 
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:

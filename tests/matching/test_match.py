@@ -100,6 +100,20 @@ def test_masks_mean_ignore(textured, method):
         assert not ((x >= 56) & (x < 104) & (y >= 46) & (y < 84)).any()
 
 
+@pytest.mark.parametrize("method", ["band", "deepmatching"])
+def test_no_patch_that_matches_is_partly_masked(method):
+    """Equal masks would match each other, whatever lies beside them."""
+    rng = np.random.default_rng(2)
+    left, right = (rng.integers(0, 255, (128, 160), dtype=np.uint8) for _ in range(2))  # they show nothing in common
+    mask = np.zeros(left.shape, bool)
+    mask[45:82, 53:106] = True
+    where = {"depth_range_mm": (-20, 20), "max_epipolar_px": np.inf, "rig": RECTIFIED} if method == "band" else {}
+    found = match(left, right, method=method, mask_left=mask, mask_right=mask, min_score=0, **where)
+    beside = cv2.dilate(mask.view(np.uint8), np.ones((7, 7))).astype(bool)  # patches have 8 x 8 px
+    x, y = np.rint(found.u_left).astype(int).T
+    assert len(found) and not beside[y, x].any()
+
+
 def test_glints_do_harm_without_a_mask_and_little_with_one(affine_pair):
     left, right = affine_pair.left.copy(), affine_pair.right.copy()
     rng = np.random.default_rng(1)
