@@ -34,7 +34,7 @@ COARSE_OFF_LINE = 5
 COARSE_WIDTH_PX = 256
 #: Half width of the coarse search, as a fraction of the canvas.
 COARSE_REACH = 0.2
-#: Least number of coarse matches for checking the rig and finding the depth range.
+#: Least number of coarse matches that agree, for checking the rig and finding the depth range; with fewer there is no match.
 MIN_SUPPORTED = 12
 
 #: Standard deviation along and off the line, in cells: gain times the one from `refine`, and a floor.  Measured on
@@ -55,12 +55,13 @@ RIDGE = 0.05
 
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
-) -> tuple[Rectification, float, tuple[float, float], float, int]:
+) -> tuple[Rectification, float, tuple[float, float], float, bool]:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth if it is not given.
 
     Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
-    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and the number of coarse
-    matches.  A ValueError refuses a rig that does not fit the images, and a depth range that the cameras do not share.
+    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and whether the images
+    show that they belong together: enough coarse matches agree, or the range was given.  A ValueError refuses a rig that
+    does not fit the images, and a depth range that the cameras do not share.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -69,8 +70,8 @@ def plan_search(
     scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
     if depth_range_mm is not None and np.isinf(max_epipolar_px):
-        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, 0
-    displacement, n_found = _coarse_displacement(images, masks, rig, whole)
+        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, True
+    displacement = _coarse_displacement(images, masks, rig, whole)
     off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
     if len(displacement) >= MIN_SUPPORTED:
         misfit = float(np.median(np.abs(displacement[:, 1])))
@@ -85,12 +86,13 @@ def plan_search(
         range_px = float(low - margin), float(high + margin)
     range_mm = whole.depth_range_mm(range_px) if depth_range_mm is None else depth_range_mm
     off_line_px = off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0
-    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, n_found
+    supported = depth_range_mm is not None or len(displacement) >= MIN_SUPPORTED
+    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, supported
 
 
-def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:
+def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> np.ndarray:
     """Displacements (n, 2) along and off the line, in pixels of the canvas `whole`, from small images matched in a wide
-    window, of the matches that agree with their neighbours.  Also the number of all matches.
+    window, of the matches that agree with their neighbours.
     """
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
@@ -108,7 +110,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     displacement = (chosen.cell + step) * CELL_PX / scale
     # The reference depths of the two canvases differ because each is rounded to whole pixels of its own canvas.
     displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
-    return displacement, len(matches.patch)
+    return displacement
 
 
 def _descriptors(
@@ -147,8 +149,8 @@ def _match(
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
-    rectification, _, range_px, off_line_px, n_found = plan_search(images, masks, rig, where)
-    if not n_found and where[1] is None:
+    rectification, _, range_px, off_line_px, supported = plan_search(images, masks, rig, where)
+    if not supported:  # such as two images of noise, which match somewhere
         none, u = np.zeros(0), np.zeros((0, 2))
         return Matches(u, u, none, np.zeros((0, 4, 4)), peak_ratio=none, reciprocal=none.astype(bool), method="band")
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
