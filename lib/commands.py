@@ -105,8 +105,14 @@ def main_reconstruct(argv: list[str]) -> int:
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
-    frame, now = recording.frames[a.frame], data.of_frames(a.frame)
-    tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
+    frame = recording.frames[a.frame]
+    pair, offsets = (rig.pair, rig.offsets) if isinstance(rig, Calibration) else (rig, _results_of_rig(a.rig)[2])
+    now = with_offsets(data, offsets).of_frames(a.frame)
+    tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
+    if tool is None or not np.isfinite(tool).all():
+        text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
+        cure = "Choose another frame, or label this one and give --landmarks annotations."
+        verdict = Verdict.join([verdict, Verdict((Reason("tool_not_masked", LEVELS[1], text, cure),))])
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
     try:
@@ -116,7 +122,8 @@ def main_reconstruct(argv: list[str]) -> int:
         print(f"Without surface.glb and points.ply: {error}")
     (out / "depth.tiff").unlink(missing_ok=True)  # from an earlier run; without parallel rays there is no depth map
     if found.rig.is_affine:
-        save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
+        depth_mm = depth_map(found.surface, found.rig.left, recording.image_size_px)
+        save_depth_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
     _write_rectified(out, found.rig, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}

@@ -148,6 +148,30 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     matrices = json.loads((tmp_path / "rectification.json").read_text())
     assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
     assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    x, y = np.rint(recording.annotations.u_left[2, 0]).astype(int)  # the tool hides the surface
+    depth_mm = cv2.imread(str(tmp_path / "depth.tiff"), cv2.IMREAD_UNCHANGED)
+    assert np.isnan(depth_mm[y, x]) and np.isfinite(depth_mm).mean() > 0.8
+
+
+def test_a_tool_without_labels_is_masked_where_the_robot_reports_it(out, tmp_path, monkeypatch, capsys):
+    """Or the verdict says that it may be in the surface."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    rows = of_recording(recording, recording.truth.u_left, recording.truth.u_right)
+    for u in (rows.u_left, rows.u_right):
+        u[rows.frame == 2] = np.nan
+    monkeypatch.setattr(commands, "_labelled", lambda recording: rows)
+    monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
+    monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
+    tools_px, real = [], commands.reconstruct
+    monkeypatch.setattr(commands, "reconstruct", lambda *a, **k: tools_px.append(k["u_landmarks"]) or real(*a, **k))
+    argv = [str(recording.folder), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
+    argv += ["--rig", str(out / "rig.json")]
+    assert commands.main_reconstruct(argv) == 0 and "tool_not_masked" not in capsys.readouterr().out
+    assert np.abs(np.array(tools_px[0]) - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
+    rows.x_mm[rows.frame == 2] = np.nan  # the robot does not know either
+    assert commands.main_reconstruct(argv) == 0 and "The surface may include the tool" in capsys.readouterr().out
+    assert "tool_not_masked" in (tmp_path / "reconstruction.json").read_text()
 
 
 def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, capsys):

@@ -10,6 +10,7 @@ DARK_SIZE_PX = 360
 #: 7 x 7 px of the reduced image.  Pictures that fill the image have nothing dark and flat in the recordings that we have.
 DARK, DIM, FLAT = 0.125, 0.5, 0.01
 
+
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
     """Specular reflections: pixels with all channels nearly saturated (245 or more), dilated by a margin for the halo.
 
