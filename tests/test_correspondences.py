@@ -48,7 +48,7 @@ def test_a_landmark_that_is_not_seen_lies_where_the_robot_reports_it():
     rows.confidence[1, 1] = 0.5 * MIN_CONFIDENCE
     found = np.array(rows.tool_px(rig)) - rig.project(path([0.0]))
     np.testing.assert_allclose(found[:, :, 0], [[0, 3, 3], [3, 0, 3]])
-    behind = StereoRig(NearAffineCamera(left.matrix, -1e3, (0, 0)), right)
+    behind = StereoRig(NearAffineCamera(left.matrix, 1.0, (0, 0), 10 * left.viewing_direction), right)
     np.testing.assert_array_equal(rows.tool_px(behind), u)
 
 
