@@ -121,7 +121,7 @@ class Correspondences:
         return self.subset(self.is_complete)
 
     def tool_px(self, rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
-        """(u_left, u_right), (n, 2) px: the landmarks that an image does not show lie where `rig` projects the robot's report.
+        """(u_left, u_right), (n, 2) px: landmarks that an image does not show lie where `rig` projects the robot's report.
 
         NaN without a report.  For masks, which must hide the tool also where it was not found.
         """

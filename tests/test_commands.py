@@ -146,7 +146,16 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     assert (told["verdict"], told["reasons"]) == (calibrated["verdict"], calibrated["reasons"])
     left, right = (cv2.imread(str(tmp_path / f"rectified_{side}.png")) for side in ("left", "right"))
     matrices = json.loads((tmp_path / "rectification.json").read_text())
-    assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
+    assert left.shape == right.shape
+    truth = Recording.open(paths.SHIPPED_RECORDING).truth  # disparities of the retina are positive, as networks expect
+    x_mm = np.load(paths.SHIPPED_RECORDING / "truth" / "surface.npz")["x_mm"].reshape(-1, 3)[::50]
+    sides = zip((matrices["left_from_canvas"], matrices["right_from_canvas"]), truth.rig.project(x_mm), strict=True)
+    a, b = (np.linalg.solve(np.array(m)[:, :2], (u - np.array(m)[:, 2]).T).T for m, u in sides)
+    disparity_px, (low, high) = a[:, 0] - b[:, 0], matrices["disparity_range_px"]
+    assert np.abs(a[:, 1] - b[:, 1]).max() < 2 and low == 0 < disparity_px.min() and disparity_px.max() < high
+    depth_mm = x_mm @ truth.rig.left.viewing_direction
+    told_px = matrices["displacement_px_per_mm"] * (matrices["reference_depth_mm"] - depth_mm)
+    assert np.abs(told_px - disparity_px).max() < 2
     assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
     recording = Recording.open(paths.SHIPPED_RECORDING)
     x, y = np.rint(recording.annotations.u_left[2, 0]).astype(int)  # the tool hides the surface
