@@ -25,7 +25,7 @@ from lib.landmarks import Detector, SharedDetector, detect
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
-from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
+from lib.surface import Reconstruction, depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
 #: Least number of landmarks for comparing a rig with cameras calibrated from them (fewer are overfitted), and least error.
@@ -105,8 +105,14 @@ def main_reconstruct(argv: list[str]) -> int:
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
-    frame, now = recording.frames[a.frame], data.of_frames(a.frame)
-    tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
+    frame = recording.frames[a.frame]
+    pair, offsets = (rig.pair, rig.offsets) if isinstance(rig, Calibration) else (rig, _results_of_rig(a.rig)[2])
+    now = with_offsets(data, offsets).of_frames(a.frame)
+    tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
+    if tool is None or not np.isfinite(tool).all():
+        text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
+        cure = "Choose another frame, or label this one and give --landmarks annotations."
+        verdict = Verdict.join([verdict, Verdict((Reason("tool_not_masked", LEVELS[1], text, cure),))])
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
     try:
@@ -116,8 +122,9 @@ def main_reconstruct(argv: list[str]) -> int:
         print(f"Without surface.glb and points.ply: {error}")
     (out / "depth.tiff").unlink(missing_ok=True)  # from an earlier run; without parallel rays there is no depth map
     if found.rig.is_affine:
-        save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
-    _write_rectified(out, found.rig, frame.left, frame.right)
+        depth_mm = depth_map(found.surface, found.rig.left, recording.image_size_px)
+        save_depth_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
+    _write_rectified(out, found, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
@@ -307,12 +314,20 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
             write_ros(camera, info, recording.image_size_px, name=side)
 
 
-def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndarray) -> None:
-    """Write the rectified pair, for any stereo network, and the matrices from it to the images."""
-    maps = rectify(rig, left.shape[:2], right.shape[:2])
-    for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, maps.right_from_canvas)):
+def _write_rectified(out: Path, found: Reconstruction, left: np.ndarray, right: np.ndarray) -> None:
+    """Write the rectified pair, and the matrices from it to the images.  Stereo networks expect disparities from 0 on."""
+    maps = rectify(found.rig, left.shape[:2], right.shape[:2])
+    sides = (maps.left_from_canvas, found.matches.u_left), (maps.right_from_canvas, found.matches.u_right)
+    x_left, x_right = (np.linalg.solve(matrix[:, :2], (u - matrix[:, 2]).T)[0] for matrix, u in sides)
+    low, high = np.percentile(x_left - x_right, (0.5, 99.5))
+    margin = 2 + 0.1 * (high - low)
+    shift = int(np.ceil(margin - low))  # a whole number, so that it does not blur
+    right_from_canvas = maps.right_from_canvas + maps.right_from_canvas[:, :1] * (0, 0, shift)
+    for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, right_from_canvas)):
         warped = cv2.warpAffine(image, matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         files.write_bytes(out / f"rectified_{side}.png", encoded(warped, ".png"))
-    numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": maps.right_from_canvas.tolist()}
-    numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": maps.reference_depth_mm}
+    reference_depth_mm = maps.reference_depth_mm + shift / maps.displacement_px_per_mm  # there the disparity is 0
+    numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": right_from_canvas.tolist()}
+    numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": reference_depth_mm}
+    numbers |= {"disparity_range_px": [0, int(np.ceil(high + margin)) + shift]}
     files.write_json(out / "rectification.json", numbers)

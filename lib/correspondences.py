@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lib.cameras import StereoRig
 from lib.geometry import pair_covariance, points
 
 #: The landmarks of the forceps, in the order of every array.
@@ -118,6 +119,18 @@ class Correspondences:
     def complete(self) -> Self:
         """The rows that are complete."""
         return self.subset(self.is_complete)
+
+    def tool_px(self, rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
+        """(u_left, u_right), (n, 2) px: landmarks that an image does not show lie where `rig` projects the robot's report.
+
+        NaN without a report.  For masks, which must hide the tool also where it was not found.
+        """
+        try:
+            projected = rig.project(self.x_mm)
+        except ValueError:  # the report is behind a near-affine camera
+            projected = np.full((2, len(self), 2), np.nan)
+        pairs = zip((self.u_left, self.u_right), projected, self.seen.T, strict=True)
+        return tuple(np.where(seen[:, None] | np.isnan(placed), u, placed) for u, placed, seen in pairs)
 
     def check_detections(self) -> None:
         """Raise a `DataError` if an image shows fewer than four landmarks whose position the robot reports."""

@@ -146,8 +146,41 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     assert (told["verdict"], told["reasons"]) == (calibrated["verdict"], calibrated["reasons"])
     left, right = (cv2.imread(str(tmp_path / f"rectified_{side}.png")) for side in ("left", "right"))
     matrices = json.loads((tmp_path / "rectification.json").read_text())
-    assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
+    assert left.shape == right.shape
+    truth = Recording.open(paths.SHIPPED_RECORDING).truth  # disparities of the retina are positive, as networks expect
+    x_mm = np.load(paths.SHIPPED_RECORDING / "truth" / "surface.npz")["x_mm"].reshape(-1, 3)[::50]
+    sides = zip((matrices["left_from_canvas"], matrices["right_from_canvas"]), truth.rig.project(x_mm), strict=True)
+    a, b = (np.linalg.solve(np.array(m)[:, :2], (u - np.array(m)[:, 2]).T).T for m, u in sides)
+    disparity_px, (low, high) = a[:, 0] - b[:, 0], matrices["disparity_range_px"]
+    assert np.abs(a[:, 1] - b[:, 1]).max() < 2 and low == 0 < disparity_px.min() and disparity_px.max() < high
+    depth_mm = x_mm @ truth.rig.left.viewing_direction
+    told_px = matrices["displacement_px_per_mm"] * (matrices["reference_depth_mm"] - depth_mm)
+    assert np.abs(told_px - disparity_px).max() < 2
     assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    x, y = np.rint(recording.annotations.u_left[2, 0]).astype(int)  # the tool hides the surface
+    depth_mm = cv2.imread(str(tmp_path / "depth.tiff"), cv2.IMREAD_UNCHANGED)
+    assert np.isnan(depth_mm[y, x]) and np.isfinite(depth_mm).mean() > 0.8
+
+
+def test_a_tool_without_labels_is_masked_where_the_robot_reports_it(out, tmp_path, monkeypatch, capsys):
+    """Or the verdict says that it may be in the surface."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    rows = of_recording(recording, recording.truth.u_left, recording.truth.u_right)
+    for u in (rows.u_left, rows.u_right):
+        u[rows.frame == 2] = np.nan
+    monkeypatch.setattr(commands, "_labelled", lambda recording: rows)
+    monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
+    monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
+    tools_px, real = [], commands.reconstruct
+    monkeypatch.setattr(commands, "reconstruct", lambda *a, **k: tools_px.append(k["u_landmarks"]) or real(*a, **k))
+    argv = [str(recording.folder), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
+    argv += ["--rig", str(out / "rig.json")]
+    assert commands.main_reconstruct(argv) == 0 and "tool_not_masked" not in capsys.readouterr().out
+    assert np.abs(np.array(tools_px[0]) - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
+    rows.x_mm[rows.frame == 2] = np.nan  # the robot does not know either
+    assert commands.main_reconstruct(argv) == 0 and "The surface may include the tool" in capsys.readouterr().out
+    assert "tool_not_masked" in (tmp_path / "reconstruction.json").read_text()
 
 
 def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, capsys):

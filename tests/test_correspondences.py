@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lib import paths
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.correspondences import (
     LANDMARKS,
     MIN_CONFIDENCE,
@@ -36,6 +37,19 @@ def shutter_pixels(time_s, readout_s, height_px):
             row_time = time_s[:, None] + readout_s * (y[..., rows][..., 1] / (height_px - 1) - 0.5)
             y[..., rows] = path(row_time) @ A[rows].T + T[rows]
     return y
+
+
+def test_a_landmark_that_is_not_seen_lies_where_the_robot_reports_it():
+    left, right = AffineCamera(np.column_stack([A[:2], T[:2]])), AffineCamera(np.column_stack([A[2:], T[2:]]))
+    rig, x = StereoRig(left, right), path([0.0])
+    u = np.array(rig.project(x)) + 3.0
+    u[0, 0], x[2] = np.nan, np.nan  # the left image does not show the base; of tip_2 there is no report
+    rows = Correspondences.of_points(x, *u, landmark=[0, 1, 2])
+    rows.confidence[1, 1] = 0.5 * MIN_CONFIDENCE
+    found = np.array(rows.tool_px(rig)) - rig.project(path([0.0]))
+    np.testing.assert_allclose(found[:, :, 0], [[0, 3, 3], [3, 0, 3]])
+    behind = StereoRig(NearAffineCamera(left.matrix, 1.0, (0, 0), 10 * left.viewing_direction), right)
+    np.testing.assert_array_equal(rows.tool_px(behind), u)
 
 
 def test_each_row_has_the_robots_position_at_its_own_instant():

@@ -10,12 +10,12 @@ from lib.cameras import StereoRig
 from lib.matching.band import MAX_PIXELS, match_band
 from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
-from lib.matching.masks import checked_mask, glint_mask, tool_mask
+from lib.matching.masks import checked_mask, dark_mask, glint_mask, tool_mask
 from lib.matching.opencv import match_with
 from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
-__all__ = ["RECTIFIED", "Matches", "checked_mask", "glint_mask", "match", "tool_mask"]
+__all__ = ["RECTIFIED", "Matches", "checked_mask", "dark_mask", "glint_mask", "match", "tool_mask"]
 
 
 def match(
@@ -35,7 +35,7 @@ def match(
             confidence)` of rectified grey uint8 images (h, w): x_right = x_left - disparity, not finite = none; confidence in
             [0, 1]; optionally its own left-right check, (h, w) bool.  None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
-        mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
+        mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `dark_mask`, `tool_mask`).
         depth_range_mm: (near, far): the depths d.x to search, where d is the left camera's `viewing_direction` and x a point
             in the rig's frame, so depth 0 is at that frame's origin.  None = found by a coarse pass.  Only used with a rig.
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
@@ -85,4 +85,5 @@ def match(
     matches = matches.keep(inside & (matches.score >= least))
     if rig is None or not len(matches):
         return matches
-    return replace(matches, epipolar_px=float(np.median(np.abs(rig.epipolar_distance(matches.u_left, matches.u_right)))))
+    distance = rig.epipolar_distance(matches.u_left, matches.u_right)  # NaN where distorted optics image nothing
+    return replace(matches, epipolar_px=float(np.nanmedian(np.abs(distance))))

@@ -10,7 +10,7 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio
-from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
+from lib.matching.descriptors import CHANNELS, PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import Rectification, on_image, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
@@ -28,13 +28,15 @@ REFINE_MARGIN = {"fast": 0, "quality": 1}
 #: The descriptors are pooled by 2^DOWNSCALE; width of a cell in canvas pixels.
 DOWNSCALE = 1
 CELL_PX = 1 << DOWNSCALE
-#: Number of cells searched on either side of the epipolar line.
+#: Number of cells searched on either side of the epipolar line.  Lines of near-affine cameras are not straight rows: down to
+#: a distance of 60 mm they deviate by up to 9 px.
 OFF_LINE = 1
+NEAR_OFF_LINE = {"fast": 2, "quality": 4}
 COARSE_OFF_LINE = 5
 COARSE_WIDTH_PX = 256
 #: Half width of the coarse search, as a fraction of the canvas.
 COARSE_REACH = 0.2
-#: Least number of coarse matches for checking the rig and finding the depth range.
+#: Least number of coarse matches that agree, for checking the rig and finding the depth range; with fewer there is no match.
 MIN_SUPPORTED = 12
 
 #: Standard deviation along and off the line, in cells: gain times the one from `refine`, and a floor.  Measured on
@@ -55,12 +57,13 @@ RIDGE = 0.05
 
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
-) -> tuple[Rectification, float, tuple[float, float], float, int]:
+) -> tuple[Rectification, float, tuple[float, float], float, bool]:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth if it is not given.
 
     Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
-    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and the number of coarse
-    matches.  A ValueError refuses a rig that does not fit the images, and a depth range that the cameras do not share.
+    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and whether the images
+    show that they belong together: enough coarse matches agree, or the range was given.  A ValueError refuses a rig that
+    does not fit the images, and a depth range that the cameras do not share.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -69,8 +72,8 @@ def plan_search(
     scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
     if depth_range_mm is not None and np.isinf(max_epipolar_px):
-        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, 0
-    displacement, n_found = _coarse_displacement(images, masks, rig, whole)
+        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, True
+    displacement = _coarse_displacement(images, masks, rig, whole)
     off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
     if len(displacement) >= MIN_SUPPORTED:
         misfit = float(np.median(np.abs(displacement[:, 1])))
@@ -85,12 +88,13 @@ def plan_search(
         range_px = float(low - margin), float(high + margin)
     range_mm = whole.depth_range_mm(range_px) if depth_range_mm is None else depth_range_mm
     off_line_px = off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0
-    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, n_found
+    supported = depth_range_mm is not None or len(displacement) >= MIN_SUPPORTED
+    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, supported
 
 
-def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:
+def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> np.ndarray:
     """Displacements (n, 2) along and off the line, in pixels of the canvas `whole`, from small images matched in a wide
-    window, of the matches that agree with their neighbours.  Also the number of all matches.
+    window, of the matches that agree with their neighbours.
     """
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
@@ -108,7 +112,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     displacement = (chosen.cell + step) * CELL_PX / scale
     # The reference depths of the two canvases differ because each is rounded to whole pixels of its own canvas.
     displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
-    return displacement, len(matches.patch)
+    return displacement
 
 
 def _descriptors(
@@ -134,42 +138,43 @@ def _descriptors(
 def _match(
     left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True
 ) -> tuple[VolumeMatches, torch.Tensor]:
-    """Matches of two grids, except those on flat or mostly masked patches or without a peak; and the correlation volume."""
+    """Matches of two grids, except those on flat or partly masked patches or without a peak; and the correlation volume."""
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), off_line)
         matches = match_volume(volume, low, reciprocal=reciprocal)
     x, y = matches.patch.T
     start = matches.cell - (low, -off_line) + matches.patch * PATCH
     cells = np.ndindex(PATCH, PATCH)
-    seen_right = np.mean([right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r, c in cells], axis=0)
-    return matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked), volume
+    seen_right = np.all([right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r, c in cells], axis=0)
+    return matches.keep(patch_quality(left)[y, x] & seen_right & matches.peaked), volume
 
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
-    rectification, _, range_px, off_line_px, n_found = plan_search(images, masks, rig, where)
-    if not n_found and where[1] is None:
+    rectification, _, range_px, off_line_px, supported = plan_search(images, masks, rig, where)
+    if not supported:  # such as two images of noise, which match somewhere
         none, u = np.zeros(0), np.zeros((0, 2))
         return Matches(u, u, none, np.zeros((0, 4, 4)), peak_ratio=none, reciprocal=none.astype(bool), method="band")
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
-    need = 4 * gy * gx * (2 * OFF_LINE + 1) * (high - low + 1) * 2.7  # bytes of the float32 volume and its pooled copies
+    off_line = OFF_LINE if rig.is_affine else NEAR_OFF_LINE[where[0]]
+    need = 4 * gy * gx * (2 * off_line + 1) * (high - low + 1) * 2.7  # bytes of the float32 volume and its pooled copies
     if need > budget_bytes:
         what = f"{high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB"
         budget = f"the budget is {budget_bytes / 2**30:.2f} GiB"
         raise ValueError(f"budget_bytes: {what}, {budget}. Narrow depth_range_mm, or take setting='fast'.")
-    left, right = _descriptors(images, masks, rectification, (low, high), OFF_LINE, off_line_px)
-    found, volume = _match(left, right, low, OFF_LINE, reciprocal=reciprocal)
+    left, right = _descriptors(images, masks, rectification, (low, high), off_line, off_line_px)
+    found, volume = _match(left, right, low, off_line, reciprocal=reciprocal)
     x, y = torch.from_numpy(found.patch.T)
     along = torch.from_numpy(found.cell[:, 0] - low)
     ratio = peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
     del volume  # large
 
-    # Start on the line at the best whole cell, and add one step of `refine`.
+    # Start at the best whole cell, on the line if the rig is affine, and add one step of `refine`.
     start = found.patch * PATCH
-    on_line = start + np.column_stack([found.cell[:, 0] - low, np.full(len(start), OFF_LINE)])
-    step, sigma = refine(left, right, start, on_line, margin=REFINE_MARGIN[where[0]])
-    displacement = step + np.column_stack([found.cell[:, 0], np.zeros(len(step))])
+    cell = found.cell * (1, 0 if rig.is_affine else 1)
+    step, sigma = refine(left, right, start, start + cell - (low, -off_line), margin=REFINE_MARGIN[where[0]])
+    displacement = step + cell
     canvas = (start + PATCH / 2) * float(CELL_PX) - 0.5
     deviation = np.hypot(SIGMA_GAIN * sigma, SIGMA_FLOOR) * CELL_PX
     linear = rectification.right_from_canvas[:, :2]

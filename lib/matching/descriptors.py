@@ -20,8 +20,6 @@ REACH_PX = 10
 STRIP_PIXELS = 1 << 17
 #: Mean squared length of the orientation channels below which a patch is flat: gradients well below 1 grey value.
 MIN_TEXTURE = 1e-4
-#: Smallest share of a patch that is not masked.
-MIN_SEEN = 0.5
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
@@ -84,10 +82,13 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
 
 
 def patch_quality(grid: np.ndarray) -> np.ndarray:
-    """(gy, gx) bool: True for the patches of descriptors (h, w, 9) that have texture and are mostly not masked."""
+    """(gy, gx) bool: True for the patches of descriptors (h, w, 9) that have texture and no masked cell.
+
+    Masked cells are zero in both images, so patches with equal masks or image borders would match whatever they show.
+    """
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
     cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
     constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
     rows = cells.reshape(gy, PATCH, gx, PATCH * CHANNELS)
     texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
-    return ((constant > 0).mean(axis=(1, 3)) >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)
+    return (constant > 0).all(axis=(1, 3)) & (texture / PATCH**2 > MIN_TEXTURE)

@@ -4,6 +4,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+#: Square root of the area in px to which `dark_mask` reduces images, which averages noise.
+DARK_SIZE_PX = 360
+#: Dark and dim are levels below these parts of the bright areas' level; flat is a standard deviation below this part, in
+#: 7 x 7 px of the reduced image.  Pictures that fill the image have nothing dark and flat in the recordings that we have.
+DARK, DIM, FLAT = 0.125, 0.5, 0.01
+
 
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
     """Specular reflections: pixels with all channels nearly saturated (245 or more), dilated by a margin for the halo.
@@ -15,6 +21,27 @@ def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
     core = cv2.inRange(np.ascontiguousarray(image), (245,) * 4, (255,) * 4)  # OpenCV uses one for each channel
     return cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2)).astype(bool)
+
+
+def dark_mask(image: np.ndarray) -> np.ndarray:
+    """The surround of a round field, and other parts without light: dark and flat areas, their blurred rim, and a margin.
+
+    Such a rim is at the same place in both images, so it would match itself.  Levels are relative to those of the bright
+    areas, so that a dim picture is not masked.  `image` as for `glint_mask`.
+    """
+    height, width = image.shape[:2]
+    factor = max(1, round(np.sqrt(height * width) / DARK_SIZE_PX))
+    small = cv2.resize(np.ascontiguousarray(image), (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    level = small.reshape(*small.shape[:2], -1).max(axis=2).astype(np.float32)
+    bright = level[level < 245]  # without glints; a mean weighted by itself hardly depends on the size of a dark area
+    bright = (bright**2).sum() / max(bright.sum(), 1.0)
+    level = cv2.blur(level, (3, 3))
+    variance = cv2.blur(level**2, (7, 7)) - cv2.blur(level, (7, 7)) ** 2
+    flat = variance < (FLAT * bright) ** 2
+    core = cv2.morphologyEx((flat & (level < DARK * bright)).view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5)))  # no specks
+    soft = cv2.dilate(core, np.ones((31, 31))) & (level < DIM * bright).view(np.uint8)  # the blurred rim of the core, too
+    grown = cv2.dilate(soft, np.ones((5, 5)))
+    return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float | None = None) -> np.ndarray:

@@ -260,7 +260,7 @@ class OnlinePipeline:
             self._surface = None  # its cameras had moved
         done, due = [], self._index % self.settings.surface_every == 0 or result.motion is not None
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
-            tool = result.landmarks.u_left, result.landmarks.u_right
+            tool = tracker.corrected(result.landmarks).tool_px(tracker.rig)
             options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
             options |= {"u_landmarks": tool, "percentiles": (1, 99)} | self._where_to_search()
             job = SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options)

@@ -193,6 +193,11 @@ class BSplineSurface:
         return ToolDistance(along_view, np.einsum("nk,nk->n", x - nearest, self.normal(u)), nearest, u)
 
 
+def fewest_points(control: tuple[int, int]) -> int:
+    """Least number of points to which `fit_surface` fits a surface with control points in these columns and rows."""
+    return max(16, control[0] * control[1] // 4)
+
+
 def fit_surface(
     u: ArrayLike, x_mm: ArrayLike, *, domain: tuple[float, float, float, float], control: tuple[int, int] = (20, 20),
     smoothness: float | None = None, reject_mm: float | None = None, covariance_mm2: ArrayLike | None = None,
@@ -225,7 +230,7 @@ def fit_surface(
     if len(u) != len(x):
         raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
     used = grid.inside(u)
-    least = max(16, grid.size // 4)
+    least = fewest_points(control)
     if used.sum() < least:
         what = f"{used.sum()} of {len(u)} points lie in the domain, and {grid.size} control points need {least} or more"
         cure = "Match more points, give fewer control points, or check that domain and u are both px of the left image"

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from lib.calibration import Calibration
 from lib.cameras import AffineCamera, Points, StereoRig
-from lib.matching import Matches, checked_mask, glint_mask, match, tool_mask
-from lib.surface.bspline import BSplineSurface, fit_surface
+from lib.matching import Matches, checked_mask, dark_mask, glint_mask, match, tool_mask
+from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
@@ -28,7 +28,7 @@ class Reconstruction:
         points: The triangulated points, with their covariances.
         matches: The matches that passed the epipolar filter, one for each point.
         n_matches: Number of matches before the filter.
-        mask_left: (h, w) bool, True where tool or glints hid the surface.
+        mask_left: (h, w) bool, True where tool, glints or darkness hid the surface.
         rig: The cameras that triangulated the points: as given, or refined by the matches.
         seconds: Wall clock of each stage: "mask", "refine" (if the rig was refined), "match", "triangulate", "surface".
     """
@@ -55,12 +55,13 @@ class Reconstruction:
 def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
     """Mask (n,) of the matches within `EPIPOLAR_SIGMAS` of their standard deviations from their epipolar lines.
 
-    The median distance is subtracted first: a calibration error may shift all epipolar lines by part of a pixel.
+    The median distance is subtracted first: a calibration error may shift all epipolar lines by part of a pixel.  Matches
+    that no point explains are dropped.
     """
     if not len(matches):
         return np.zeros(0, dtype=bool)
     distance = rig.epipolar_distance(matches.u_left, matches.u_right)
-    return np.abs(distance - np.median(distance)) < EPIPOLAR_SIGMAS * matches.sigma_along(rig.epipolar_normal)
+    return np.abs(distance - np.nanmedian(distance)) < EPIPOLAR_SIGMAS * matches.sigma_along(rig.epipolar_normal)
 
 
 def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
@@ -130,7 +131,7 @@ def reconstruct(
         method: The matcher; see `lib.matching.match`.
         refine: Correct the rig with a first, fast matching (`refine_rig`); None = only for a calibration of affine cameras.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
-        mask_left, mask_right: (h, w) bool, True = ignore, in addition to glints and tool.
+        mask_left, mask_right: (h, w) bool, True = ignore, in addition to glints, darkness and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.
         control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
         depth_only: Fit one spline instead of three: the depth along the rays of the left camera, which must be affine.
@@ -160,8 +161,10 @@ def reconstruct(
     fast = setting == "fast"
 
     with _timed(seconds, "mask"):
-        masks = {"mask_left": glint_mask(left), "mask_right": glint_mask(right)}
+        masks = {f"mask_{name}": glint_mask(image) | dark_mask(image) for name, image in (("left", left), ("right", right))}
         for side, (name, given) in enumerate((("mask_left", mask_left), ("mask_right", mask_right))):
+            if masks[name].all():
+                raise ValueError(f"{name.removeprefix('mask_')}: the whole image is saturated or dark; change the exposure.")
             if u_landmarks is not None:
                 masks[name] |= tool_mask(masks[name].shape, u_landmarks[side])
             if given is not None:
@@ -176,8 +179,10 @@ def reconstruct(
         matches = found.keep(epipolar_inliers(rig, found))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
     with _timed(seconds, "surface"):
-        if not len(matches):
-            raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
+        if len(matches) < (least := fewest_points(control)):
+            cure = "Are both images sharp and textured, do they show the same part, does the rig fit?"
+            cure += "" if fast else " In smooth images setting='fast' finds more."
+            raise ValueError(f"left, right: {len(matches)} matches lie on their epipolar lines; {least} are needed. {cure}")
         domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
         depth_only = fast and rig.is_affine if depth_only is None else depth_only
         how = {"control": control, "smoothness": smoothness, "camera": rig.left if depth_only else None, "quick": fast}

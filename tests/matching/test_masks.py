@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from lib.matching import glint_mask, tool_mask
+from lib.matching import dark_mask, glint_mask, tool_mask
 
 
 def test_glints_are_saturated_in_every_channel_and_grown():
@@ -22,6 +23,41 @@ def test_glints_are_saturated_in_every_channel_and_grown():
     assert np.array_equal(glint_mask(image[..., 0], grow_px=0)[20:24, 30:34], np.ones((4, 4), bool))
     with pytest.raises(ValueError, match="image: expected a uint8"):
         glint_mask(image / 255.0)
+
+
+def textured_image(mean: float, sd: float) -> np.ndarray:
+    """(360, 480, 3) uint8, with noise of 0.5."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.standard_normal((360, 480, 1)).astype(np.float32), (0, 0), 3)[..., None]
+    image = mean + sd * texture / texture.std() + rng.normal(0, 0.5, (360, 480, 3))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.1])
+def test_the_surround_is_dark_and_a_dim_picture_is_not(gain):
+    image = textured_image(130 * gain, 25 * gain)
+    assert not dark_mask(image).any() and not dark_mask(image[..., 0]).any()
+    image[300:310, 400:410] = 255  # a glint
+    image[:60, :80] = textured_image(0, 0)[:60, :80]
+    mask = dark_mask(image)
+    assert mask[:60, :80].all() and not mask[70:].any() and not mask[:, 90:].any()
+    large = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
+    assert np.mean(dark_mask(large)[1::3, 1::3] != mask) < 0.01
+    assert not dark_mask(textured_image(4, 1)).any() and not dark_mask(np.zeros((20, 30, 3), np.uint8)).any()
+
+
+def test_the_blurred_rim_of_a_surround_is_masked():
+    field = cv2.circle(np.zeros((360, 480), np.uint8), (240, 180), 120, 255, -1)
+    field = cv2.GaussianBlur(field, (0, 0), 6)
+    mask = dark_mask((textured_image(130, 25) * (field[:, :, None] / 255)).astype(np.uint8))
+    assert mask[field < 90].all() and mask[field > 250].mean() < 0.01
+
+
+def test_what_is_dark_and_textured_is_not_masked():
+    """A shadow, beside a bright part."""
+    image = textured_image(130, 25)
+    image[:, :240] = textured_image(15, 6)[:, :240]
+    assert dark_mask(image).mean() < 0.05
 
 
 def test_tool_covers_jaws_and_shaft():

@@ -162,10 +162,17 @@ def test_missing_landmarks():
             found.u[:], found.confidence[:] = np.nan, 0.0
         return found
 
-    pipeline = make(world, detector=detect)
+    tools_px = []
+
+    def reconstruct(*images, u_landmarks, **options):
+        tools_px.append(np.array(u_landmarks) - world.rig.project(world.x_mm[world.frame]))
+        return world.reconstruct(*images, u_landmarks=u_landmarks, **options)
+
+    pipeline = make(world, detector=detect, reconstruct=reconstruct)
     results = run(pipeline, world, 40)
     assert results[-1].state == "tracking"
     assert not any(r.failures for r in results)
+    assert len(tools_px) > 20 and np.abs(tools_px).max() < 100  # hidden where the robot reports it
     assert np.isnan(results[30].landmarks.u_left).all()
     assert np.isfinite(results[30].distance_mm).all()  # from the robot's report
     assert results[30].reconstructed_at == 30
