@@ -150,6 +150,8 @@ def test_a_callable_is_a_matcher(textured):
     assert len(every) == len(matches) and np.array_equal(every.reciprocal, every.u_left[:, 1] > 63)
     with pytest.raises(ValueError, match=r"method: .* shape"):
         match(textured, textured, method=lambda left, right, range_px: (left[:5], left), rig=RECTIFIED)
+    with pytest.raises(ValueError, match=r"must return \(disparity, confidence\) or .*; got 1 of the shapes \(\d+, \d+\)\.$"):
+        match(textured, textured, method=lambda left, right, range_px: left, rig=RECTIFIED)
 
 
 @pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
