@@ -361,7 +361,7 @@ class StereoRig:
         """Read a file of `save`.  A FileNotFoundError or ValueError names the file; a rig that sees no depth is refused."""
         path = Path(path)
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; StereoRig.save writes one.")
+            raise FileNotFoundError(f"{path}: no such file; `python3 -m lib calibrate RECORDING` writes rig.json.")
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             for key, expected in (("format", FORMAT), ("units", UNITS)):

@@ -30,6 +30,8 @@ from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, repor
 
 #: Least number of landmarks for comparing a rig with cameras calibrated from them (fewer are overfitted), and least error.
 _FEWEST, _EXACT_PX = 24, 0.5
+#: Fewer points for each pixel that is not masked show, in the setting "quality", that the images are smooth or noisy.
+_FEW = 1e-3
 
 
 def main_import(argv: list[str]) -> int:
@@ -126,6 +128,9 @@ def main_reconstruct(argv: list[str]) -> int:
         save_depth_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
     _write_rectified(out, found, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
+    few = a.setting == "quality" and len(found.u) < _FEW * (~found.mask_left).sum()
+    hint = " These are few: --setting fast may be more accurate, as in smooth images." if few else ""
+    print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches.{hint}")
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
 
@@ -133,10 +138,11 @@ def main_reconstruct(argv: list[str]) -> int:
 def main_register(argv: list[str]) -> int:
     """`python3 -m lib register`: find the calibrated cameras again, after the microscope was moved."""
     a, recording, out = _parsed("register", main_register, argv)
-    data, (*_, offsets) = _data(a, recording), _results_of_rig(a.rig)
+    rig, (*_, offsets) = StereoRig.load(a.rig), _results_of_rig(a.rig, image_size_px=recording.image_size_px)
+    data = _data(a, recording)
     seen = with_offsets(data, offsets)
-    found = register_images(StereoRig.load(a.rig), seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
-    moved, seen = StereoRig.load(a.rig).moved(found.transform), seen.complete
+    found = register_images(rig, seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
+    moved, seen = rig.moved(found.transform), seen.complete
     epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
     medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
@@ -165,8 +171,13 @@ def _offsets_entries(offsets: LandmarkOffsets | None) -> dict:
     return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
-def _results_of_rig(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOffsets | None]:
-    """From the result file beside a rig: its recording ("" if not of this frame), its verdict, the landmarks' offsets."""
+def _results_of_rig(
+    rig: Path, frame: int = 0, image_size_px: tuple[int, int] | None = None
+) -> tuple[str, Verdict, LandmarkOffsets | None]:
+    """From the result file beside a rig: its recording ("" if not of this frame), its verdict, the landmarks' offsets.
+
+    A ValueError refuses a rig for images of another size than `image_size_px`, (width, height).
+    """
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
     if not path.is_file():
         return "", Verdict(), None
@@ -175,11 +186,14 @@ def _results_of_rig(rig: Path, frame: int = 0) -> tuple[str, Verdict, LandmarkOf
         offset, turns = results["landmark_offsets_mm"], bool(results["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
         own = rig.name in ("rig.json", "moved_rig.json") and "recording" in results  # they are not about a refined rig
-        own = own and frame in range(*results["frames"])
+        own, size = own and frame in range(*results["frames"]), tuple(results.get("image_size_px", image_size_px or ()))
         folder, verdict = results["recording"] if own else "", Verdict(tuple(Reason(**r) for r in results["reasons"] if own))
     except (ValueError, KeyError, TypeError) as error:
         what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
         raise ValueError(f"{what}; calibrate again, or move that file away.") from None
+    if image_size_px and size != tuple(image_size_px):
+        what = "its cameras are for images of {} x {} px, the recording has {} x {} px".format(*size, *image_size_px)
+        raise ValueError(f"{paths.shown(rig)}: {what}; calibrate with images of this size.")
     unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
     return folder, verdict, None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
 
@@ -224,6 +238,7 @@ def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Name
     a.options = {"model": a.model} if a.model else {}
     Model.parse(a.model or "zero_skew", 2)  # refuses an unknown model
     recording = Recording.open(a.recording)
+    a.image_size_px = recording.image_size_px
     some, a.frames = a.frames, recording.frames_of(a.frames or ":")
     if name == "reconstruct":
         a.frame = a.frames[0] if a.frame is None else a.frame + len(recording) * (a.frame < 0)
@@ -258,9 +273,10 @@ def _calibrated(
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
     """The calibration (None if refused) or the rig of --rig; the verdict; the landmarks."""
     given = getattr(a, "rig", None)  # with a rig, only the frame's landmarks are needed, to mask the tool
+    if given:  # first, since the detector takes its time
+        rig, (folder, verdict, _) = StereoRig.load(given), _results_of_rig(given, a.frame, recording.image_size_px)
     data = _data(a, recording, np.array([a.frame]) if given else None)
     if given:
-        rig, (folder, verdict, _) = StereoRig.load(given), _results_of_rig(given, a.frame)
         if folder != str(recording.folder.resolve()):
             text = f"{given}: nothing here shows that this rig fits this frame."
             same = [f"--{name}={value}" for name in ("weights", "landmarks") if (value := getattr(a, name, None))]
@@ -287,7 +303,8 @@ def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = T
 
 
 def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
-    numbers |= {"recording": str(a.recording.resolve()), "frames": [a.frames.start, a.frames.stop]} | verdict.to_json()
+    numbers |= {"recording": str(a.recording.resolve()), "frames": [a.frames.start, a.frames.stop]}
+    numbers |= {"image_size_px": list(a.image_size_px)} | verdict.to_json()
     files.write_json(out / f"{name}.json", numbers)
     written = sorted(path.name for path in out.iterdir() if path.lstat().st_mtime_ns != a.earlier.get(path))
     print(f"Wrote {paths.shown(out)}: {', '.join(written)}\n{verdict}")

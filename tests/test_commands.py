@@ -123,6 +123,21 @@ def test_register_writes_no_cameras_under_a_red_verdict(out, tmp_path, capsys):
     assert not (tmp_path / "verdict.json").exists() and "moved by" in capsys.readouterr().out
 
 
+def test_a_rig_that_is_missing_or_for_images_of_another_size_is_refused_at_once(out, tmp_path, monkeypatch):
+    """Before the detector looks at any frame."""
+    monkeypatch.setattr(commands, "_data", lambda *_: pytest.fail("it detects"))
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--out", str(tmp_path), "--rig"]
+    shutil.copy(out / "rig.json", tmp_path)
+    told = json.loads((out / "calibration.json").read_text())
+    assert told["image_size_px"] == [1920, 1080]
+    (tmp_path / "calibration.json").write_text(json.dumps(told | {"image_size_px": [1280, 720]}))
+    for command in (commands.main_register, commands.main_reconstruct):
+        with pytest.raises(FileNotFoundError, match=r"calibrate RECORDING` writes rig\.json"):
+            command([*argv, str(tmp_path)])
+        with pytest.raises(ValueError, match=r"rig\.json: its cameras are for images of 1280 x 720 px, .* 1920 x 1080 px"):
+            command([*argv, str(tmp_path / "rig.json")])
+
+
 def test_register_says_where_no_motion_explains_the_landmarks(out):
     """A rig of another zoom, or of another microscope."""
     rig = StereoRig.load(out / "rig.json")
@@ -141,7 +156,7 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
     assert commands.main_reconstruct([*argv, "--rig", str(out / "rig.json")]) == 0
     told = json.loads((tmp_path / "reconstruction.json").read_text())
-    assert told["frame"] == 2 and told["points"] > 500
+    assert told["frame"] == 2 and told["points"] > 500 and f"Frame 2: {told['points']} points" in capsys.readouterr().out
     calibrated = json.loads((out / "calibration.json").read_text())  # from this recording: its verdict holds
     assert (told["verdict"], told["reasons"]) == (calibrated["verdict"], calibrated["reasons"])
     left, right = (cv2.imread(str(tmp_path / f"rectified_{side}.png")) for side in ("left", "right"))
@@ -173,13 +188,22 @@ def test_a_tool_without_labels_is_masked_where_the_robot_reports_it(out, tmp_pat
     monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
     monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
     tools_px, real = [], commands.reconstruct
-    monkeypatch.setattr(commands, "reconstruct", lambda *a, **k: tools_px.append(k["u_landmarks"]) or real(*a, **k))
-    argv = [str(recording.folder), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
-    argv += ["--rig", str(out / "rig.json")]
-    assert commands.main_reconstruct(argv) == 0 and "tool_not_masked" not in capsys.readouterr().out
-    assert np.abs(np.array(tools_px[0]) - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
+
+    def reconstruct(*images, u_landmarks, setting):
+        tools_px.append(np.array(u_landmarks))
+        return real(*images, u_landmarks=u_landmarks, setting="fast")  # quality takes its time
+
+    monkeypatch.setattr(commands, "reconstruct", reconstruct)
+    argv = [str(recording.folder), *LABELS, "--frame", "2", "--out", str(tmp_path), "--rig", str(out / "rig.json")]
+    assert commands.main_reconstruct(argv) == 0
+    said = capsys.readouterr().out
+    assert "tool_not_masked" not in said and "--setting fast may be more accurate" not in said
+    assert np.abs(tools_px[0] - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
     rows.x_mm[rows.frame == 2] = np.nan  # the robot does not know either
-    assert commands.main_reconstruct(argv) == 0 and "The surface may include the tool" in capsys.readouterr().out
+    monkeypatch.setattr(commands, "_FEW", 1.0)
+    assert commands.main_reconstruct(argv) == 0
+    said = capsys.readouterr().out
+    assert "The surface may include the tool" in said and "--setting fast may be more accurate" in said
     assert "tool_not_masked" in (tmp_path / "reconstruction.json").read_text()
 
 

@@ -76,10 +76,13 @@ def match_with(
     left, valid_left = warp(images[0], rectification.left_from_canvas, size, shift_px=shift, mask=masks[0])
     right, valid_right = warp(images[1], rectification.right_from_canvas, size, shift_px=shift, mask=masks[1])
     left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (left, right))
-    disparity, confidence, *rest = maps = [np.asarray(part) for part in call(left, right, (-high, -low))]
-    shapes = [part.shape for part in maps]
-    if any(shape != left.shape for shape in shapes):
-        raise ValueError(f"method: the matcher {name} must return arrays of the shape {left.shape}, got {shapes}.")
+    maps = call(left, right, (-high, -low))
+    shapes = [np.shape(part) for part in maps] if isinstance(maps, tuple | list) else [np.shape(maps)]
+    if len(shapes) not in (2, 3) or any(shape != left.shape for shape in shapes):
+        what = f"(disparity, confidence) or (disparity, confidence, passed), arrays of the shape {left.shape}"
+        got = f"{len(shapes)} of the shapes {', '.join(map(str, shapes[:3]))}"
+        raise ValueError(f"method: the matcher {name} must return {what}; got {got}.")
+    disparity, confidence, *rest = map(np.asarray, maps)
     passed = rest[0].astype(bool) if rest else np.ones(left.shape, dtype=bool)
 
     columns, rows = (np.arange(LATTICE_PX // 2, side // LATTICE_PX * LATTICE_PX, LATTICE_PX) for side in (width, height))

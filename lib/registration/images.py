@@ -193,6 +193,8 @@ def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Lo
     if loss not in ("squared", "robust"):
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
     stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, loss, stale)[0])
+    if np.isinf(_evaluate(rig, data, loss, stale)[0]):
+        raise ValueError("x_mm: landmarks lie behind the rig's cameras. Did these move that far? Then calibrate again.")
     found = _minimum(rig, data, stale, loss, parameters)
     for _ in range(0 if data.scale_known else 1 if loss == "squared" else 5):
         distance2, dimension = found.residuals[data.dimension > 0] ** 2, data.dimension[data.dimension > 0]
@@ -226,7 +228,8 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters, tolerance=1e-11)
     information, (_, distance2, weights) = found.information, found.work
     if np.linalg.matrix_rank(information, tol=_UNDETERMINED * np.trace(information), hermitian=True) < parameters:
-        raise ValueError("x_mm, u_left, u_right: these landmarks do not determine the motion. Add frames in other positions.")
+        cure = "Add frames in other positions." if data.seen.any(axis=0).all() else "Both cameras must see the tool."
+        raise ValueError(f"x_mm, u_left, u_right: these landmarks do not determine the motion. {cure}")
     covariance = np.linalg.pinv(information, rcond=_UNDETERMINED, hermitian=True)
     n, size = used.sum(), data.dimension.sum()
     own = covariance * distance2.sum() / max(size - parameters, 1)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.cameras import AffineCamera, StereoRig
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED, Matches, glint_mask, match
 from lib.simulator.rig import reference_rig
@@ -150,6 +150,8 @@ def test_a_callable_is_a_matcher(textured):
     assert len(every) == len(matches) and np.array_equal(every.reciprocal, every.u_left[:, 1] > 63)
     with pytest.raises(ValueError, match=r"method: .* shape"):
         match(textured, textured, method=lambda left, right, range_px: (left[:5], left), rig=RECTIFIED)
+    with pytest.raises(ValueError, match=r"must return \(disparity, confidence\) or .*; got 1 of the shapes \(\d+, \d+\)\.$"):
+        match(textured, textured, method=lambda left, right, range_px: left, rig=RECTIFIED)
 
 
 @pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
@@ -221,6 +223,14 @@ def test_epipolar_lines_of_near_cameras_are_followed():
     error_mm = np.abs(rig.triangulate(found.u_left, found.u_right).x_mm[:, 2])
     corner = (np.abs(found.u_left - (320, 180)) > (240, 120)).all(axis=1)
     assert corner.sum() > 150 and np.percentile(error_mm[corner], 90) < 0.1
+
+
+def test_matches_where_distorted_optics_image_nothing_do_not_hide_the_others_distance(textured):
+    barrel = NearAffineCamera(RECTIFIED.left.matrix, 0.0, (80, 64), radial_per_px2=-3e-5)  # nothing beyond 70 px
+    options = {"rig": StereoRig(barrel, RECTIFIED.right), "depth_range_mm": (0, 20), "max_epipolar_px": np.inf}
+    matches = match(textured, shifted(textured, 12), **options)
+    distance = options["rig"].epipolar_distance(matches.u_left, matches.u_right)
+    assert 0 < np.isnan(distance).mean() < 0.5 and matches.epipolar_px == np.nanmedian(np.abs(distance))
 
 
 def turned(rig: StereoRig) -> StereoRig:

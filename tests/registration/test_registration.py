@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -256,7 +257,7 @@ def test_gross_outliers_lose_their_weight():
         (lambda x, ul, ur: (x * np.nan, ul, ur), "0 points"),
         (lambda x, ul, ur: (x, ul * np.nan, ur * np.nan), "0 points"),
         (lambda x, ul, ur: (np.linspace(0, 1, 30)[:, None] * [1, 2, 3] + CENTRE_MM, ul, ur), "on one line"),
-        (lambda x, ul, ur: (x, ul, ur * np.nan), "do not determine the motion"),
+        (lambda x, ul, ur: (x, ul, ur * np.nan), "do not determine the motion. Both cameras must see the tool"),
     ],
 )
 def test_bad_images(change, text):
@@ -369,6 +370,18 @@ def test_the_near_affine_camera_that_moved_is_named(moved):
 
 
 # --- correspondences ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("along_mm", [-160, 160])
+def test_cameras_that_moved_to_behind_the_tool_are_named(along_mm):
+    """As seen from where they were."""
+    rig = reference_rig(inverse_distance_per_mm=1 / 150)
+    x = np.random.default_rng(0).normal(0, 2, (30, 3)) + CENTRE_MM
+    shift_mm = along_mm * rig.left.viewing_direction
+    moved = rig.moved(RigidTransform(np.eye(3), shift_mm))
+    with pytest.raises(ValueError, match="x_mm: landmarks lie behind the rig's cameras") if along_mm < 0 else nullcontext():
+        found = identify_motion(rig, x + shift_mm, *moved.project(x + shift_mm), covariance_px2=1.0)
+        assert np.abs(found.left.transform.t - shift_mm).max() < 1
 
 
 def with_covariance(data: Correspondences, variance_px2: np.ndarray) -> Correspondences:
