@@ -128,8 +128,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--shipped takes no other option, and --overwrite is for --rung.")
     if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
-    if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
-        parser.error("--seed must not be negative, --duration must be positive and finite.")
+    if arguments.seed < 0 or not max((arguments.pairs - 1) / Microscope.fps, 1e-3) <= arguments.duration < float("inf"):
+        parser.error(f"--seed: at least 0; --duration: finite, and long enough for --pairs at {Microscope.fps:g} Hz.")
     pairs, shrink, seed = arguments.pairs, arguments.shrink, arguments.seed
     if arguments.shipped or arguments.rung:
         if arguments.shipped:  # with an eye and a tool that no training saw

@@ -111,7 +111,7 @@ def test_a_damaged_sequence_is_named_and_not_passed_over(made, tmp_path):
 @pytest.mark.parametrize(
     "words",
     [["--seed", "-1"], ["--duration", "nan"], ["--duration", "0"], ["--pairs", "0"], ["--folder", "{file}"],
-     ["--shipped"], ["--shipped", "--rung", "near"], ["--rung", "near", "--dry-run"], ["--overwrite"]],
+     ["--pairs", "27"], ["--shipped"], ["--shipped", "--rung", "near"], ["--rung", "near", "--dry-run"], ["--overwrite"]],
 )  # fmt: skip
 def test_wrong_values_end_with_a_message(words, tmp_path, monkeypatch):
     """Of argparse, or as an error that `python3 -m lib` tells in one line."""
