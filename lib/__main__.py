@@ -33,9 +33,11 @@ def main(argv: list[str]) -> int:
         return _use_another_python(argv)
     from lib import environment
 
-    parser = argparse.ArgumentParser(prog="python3 -m lib", usage=USAGE, add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser("python3 -m lib", USAGE, add_help=argv[0] not in COMMANDS, allow_abbrev=False)
     parser.add_argument("--torch", choices=environment.TORCH_BUILDS)
     options, argv = parser.parse_known_args(argv)
+    if argv[0] not in COMMANDS and argv not in (["setup"], ["lock"], ["lock", "--upgrade"]):
+        parser.error(f"{argv[0]}: it takes no {' '.join(argv[1:])}")
     try:
         if argv[0] == "lock":
             print(f"Wrote {environment.lock(upgrade='--upgrade' in argv).relative_to(ROOT)}")

@@ -141,6 +141,9 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
     torch = torch or stamp.get("torch") or ("cuda" if _has_nvidia_gpu() else "cpu")
     update = stamp.get("state") == "ready" and python_of(venv).exists()
     if not update:
+        for path in () if venv.is_symlink() else venv.glob("*"):  # the stamp goes last, so that a new start knows the folder
+            if path.name != _STAMP:
+                shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(venv, ignore_errors=True)
         _check_disk(root, workbench["disk_gb"][torch])
     cost = f"{workbench['disk_gb'][torch]} GB of disk and up to {workbench['download_gb'][torch]} GB of download"

@@ -150,6 +150,38 @@ def test_half_made_is_made_anew(root, made, monkeypatch):
     assert not (root / ".venv" / "half_a_package").exists()
 
 
+def test_a_stop_while_it_is_removed_blocks_no_new_start(root, made, monkeypatch):
+    """A folder may list the stamp first; but what takes long is removed before it."""
+    environment.ensure(root)
+    venv, removed, remove = root / ".venv", [], shutil.rmtree
+    environment.write_text(venv / "microstereo.json", json.dumps({"state": "making", "torch": "cpu"}))
+
+    def stopped(path, **options):
+        (path / "microstereo.json").unlink(missing_ok=True)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(environment.shutil, "rmtree", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            environment.ensure(root)
+        patch.setattr(environment.shutil, "rmtree", lambda path, **options: removed.append(path) or remove(path, **options))
+        environment.ensure(root)
+    assert stamp(root)["state"] == "ready" and len(made) == 2
+    assert removed[-1] == venv and {path for path in venv.iterdir() if path.is_dir() and path.name != "etc"} <= {*removed}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_the_environment_behind_a_link_is_not_removed(root, made, monkeypatch):
+    other = root / "other"
+    (other / "lib").mkdir(parents=True)
+    (other / "microstereo.json").write_text(json.dumps({"state": "making", "torch": "cpu"}), encoding="utf-8")
+    (root / ".venv").symlink_to(other)
+    monkeypatch.setattr(environment, "_make_venv", lambda venv: (_ for _ in ()).throw(Problem("a link")))
+    with pytest.raises(Problem, match="a link"):
+        environment.ensure(root)
+    assert (other / "lib").is_dir()
+
+
 def test_a_lost_interpreter_is_made_anew(root, made):
     python = environment.ensure(root)
     python.unlink()

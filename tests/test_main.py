@@ -56,6 +56,26 @@ def test_an_unknown_torch_build_is_an_error(inside, capsys):
     assert stop.value.code == 2 and "invalid choice: 'rocm'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("argv", "code"),
+    [(["lock", "--help"], 0), (["setup", "-h"], 0), (["setup", "--torhc", "cuda"], 2), (["lock", "torch"], 2),
+     (["setup", "--upgrade"], 2)],
+)  # fmt: skip
+def test_setup_and_lock_do_nothing_but_what_they_are_asked(argv, code, monkeypatch, capsys):
+    monkeypatch.setattr(environment, "ensure", None)
+    monkeypatch.setattr(environment, "lock", None)
+    with pytest.raises(SystemExit) as stop:
+        command_line.main(argv)
+    said = capsys.readouterr()
+    assert stop.value.code == code and ("it takes no" in said.err if code else "pin the packages anew" in said.out)
+
+
+def test_lock_upgrades_on_request(monkeypatch):
+    asked = []
+    monkeypatch.setattr(environment, "lock", lambda upgrade: asked.append(upgrade) or command_line.ROOT / "a.lock")
+    assert command_line.main(["lock"]) == command_line.main(["lock", "--upgrade"]) == 0 and asked == [False, True]
+
+
 @pytest.mark.parametrize("command", ["check", "sweep"])
 def test_commands_that_detect_keep_their_detections_for_the_next_one(command, monkeypatch, tmp_path):
     monkeypatch.setattr(paths, "CACHE", tmp_path)

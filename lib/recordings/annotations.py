@@ -123,21 +123,20 @@ def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks:
     All else in the file stays: other images, other keypoints, other keys.
     """
     content = json.loads(path.read_bytes()) if path.exists() else _empty(landmarks)
-    images, entries = content["images"], content["annotations"]
+    images, entries, categories = content["images"], content["annotations"], content["categories"]
     ids = [one["id"] for one in images if _place(one["file_name"]) == _place(image)]
     if not ids:
         ids = [1 + max((one["id"] for one in images), default=0)]
         images.append(_image(ids[0], image, image_size_px))
     at = next((k for k, one in enumerate(entries) if one["image_id"] in ids), len(entries))
     if at == len(entries):
-        categories = content["categories"]
         category = next((c for c in categories if set(landmarks) <= set(c.get("keypoints", ()))), None)
         if category is None:
             category = _empty(landmarks)["categories"][0] | {"id": 1 + max((c["id"] for c in categories), default=0)}
             categories.append(category)
         identity = 1 + max((one.get("id", 0) for one in entries), default=0)
         entries.append({"id": identity, "image_id": ids[0], "category_id": category["id"]})
-    names = {c["id"]: c["keypoints"] for c in content["categories"] if "keypoints" in c}[entries[at]["category_id"]]
+    names = {c["id"]: c["keypoints"] for c in categories if "keypoints" in c}[entries[at]["category_id"]]
     entries[at] = _filled(entries[at], names, landmarks, values)
     write_text(path, json.dumps(content, allow_nan=False) + "\n")
 

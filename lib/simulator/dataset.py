@@ -79,9 +79,13 @@ def make_dataset(
     A sequence appears whole or not at all: after a kill, the next call keeps the finished ones and makes the others.
     `workers` is the number of processes; None = one per core.  Raises ValueError if `folder` holds another data set.
     """
-    text = _stamp(folder, seed, n_pairs, duration_s, shrink)
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_text(folder / "dataset.json", text)
+    stamp = folder / "dataset.json"
+    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
+    text = json.dumps({"seed": seed, **size}, indent=1) + "\n"
+    if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
+        raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
+    files.write_text(stamp, text)
     for leftover in folder.glob("t*_??.[0-9]*-*.partial"):  # of a killed run, unless another run is writing it
         if not lives(int(leftover.suffixes[0][1:].partition("-")[0])):
             shutil.rmtree(leftover, ignore_errors=True)
@@ -92,15 +96,6 @@ def make_dataset(
         if error and not sequence.exists():  # else another run was faster
             raise error
     return list(jobs)
-
-
-def _stamp(folder: Path, seed: int, n_pairs: int, duration_s: float, shrink: int) -> str:
-    """The text of a data set's dataset.json; a ValueError if `folder` holds another data set."""
-    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
-    stamp, text = folder / "dataset.json", json.dumps({"seed": seed, **size}, indent=1) + "\n"
-    if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
-        raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
-    return text
 
 
 def seconds_a_pair(shrink: int) -> float:
@@ -133,8 +128,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--shipped takes no other option, and --overwrite is for --rung.")
     if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
-    if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
-        parser.error("--seed must not be negative, --duration must be positive and finite.")
+    if arguments.seed < 0 or not max((arguments.pairs - 1) / Microscope.fps, 1e-3) <= arguments.duration < float("inf"):
+        parser.error(f"--seed: at least 0; --duration: finite, and long enough for --pairs at {Microscope.fps:g} Hz.")
     pairs, shrink, seed = arguments.pairs, arguments.shrink, arguments.seed
     if arguments.shipped or arguments.rung:
         if arguments.shipped:  # with an eye and a tool that no training saw
@@ -150,7 +145,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{seed}"
-    _stamp(folder, seed, pairs, arguments.duration, shrink)
     made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
     for sequence in made:  # finished sequences must open as recordings
         try:

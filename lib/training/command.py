@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lib import paths
 from lib.files import write_json
+from lib.geometry import check
 from lib.landmarks import Detector
 from lib.provenance import plain
 from lib.recordings import Recording, read_image
@@ -45,6 +46,11 @@ def main(argv: list[str] | None = None) -> int:
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     a = parser.parse_args(argv)
+    check(a, "every steps features workers", lambda v: v is None or v >= 1, "must be at least 1")
+    check(a, "seed scenes closeups held_out", lambda v: v >= 0, "must not be negative")
+    check(a, "rate minutes", lambda v: v is None or v > 0, "must be positive")
+    if a.what == "finetune" and any(getattr(a, name) != parser.get_default(name) for name in ("rate", "features", "preset")):
+        parser.error("finetune: takes no --rate, --features or --preset; it has its own.")
     if a.recordings and a.what not in ("finetune", "assemble"):
         parser.error(f"{a.what}: takes no recordings.")
     if a.what == "generate":
@@ -117,8 +123,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, help="evaluate every N-th labelled frame")
     parser.add_argument("--json", type=Path, help="write the scores here")
     a = parser.parse_args(argv)
-    if a.every < 1:
-        parser.error("--every: must be at least 1.")
+    check(a, "every", lambda v: v >= 1, "must be at least 1")
     if a.json and not a.json.parent.is_dir():
         parser.error(f"--json: there is no folder {a.json.parent}; make it first.")
     result = evaluate(Detector.load(a.weights), labelled_images(Recording.open(a.recording), every=a.every), progress=True)

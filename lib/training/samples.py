@@ -37,8 +37,7 @@ def labelled_frames(recording: Recording) -> list[int]:
     Raises ValueError if the recording has neither truth nor annotations, or other landmarks than the detector.
     """
     if recording.skeleton != LANDMARKS:
-        what = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
-        raise ValueError(f"{recording.name}: {what}; give a recording of a forceps.")
+        raise ValueError(f"{recording.name}: its landmarks are {list(recording.skeleton)}; give one with {list(LANDMARKS)}.")
     if recording.truth:
         return list(range(len(recording.frames)))
     if (labels := recording.annotations) is None:

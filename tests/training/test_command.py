@@ -1,5 +1,6 @@
 """The commands `train` and `evaluate`, fine-tuning on labelled frames, and the model card."""
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -162,6 +163,20 @@ def test_a_stopped_fine_tuning_stops_all_stages(tmp_path, monkeypatch):
 
     with pytest.raises(KeyboardInterrupt):
         stages.finetune(detector, images[:2], images[2:], tmp_path, steps=10**6, progress=stop)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [("frame --rate 0", "rate: must be positive"), ("frame --seed -1", "seed: must not be negative"),
+     ("generate --scenes -1", "scenes: must not"), ("propose --workers 0", "workers: must be at least 1"),
+     ("finetune a --out b --every -1", "every: must be at least 1"), ("finetune a --out b --rate 1", "takes no --rate")],
+)  # fmt: skip
+def test_numbers_that_cannot_be_and_options_without_effect_are_refused(words, said, tmp_path, monkeypatch, capsys):
+    for name in ("generate", "propose", "train", "finetune"):  # it does not come to that
+        monkeypatch.setattr(command, name, None)
+    with contextlib.suppress(SystemExit):
+        assert COMMANDS["train"]([*words.split(), "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_fine_tuning_needs_recordings_and_a_file(tmp_path, monkeypatch, capsys):

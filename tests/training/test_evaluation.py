@@ -120,5 +120,5 @@ def test_labels_are_the_truth_or_else_the_annotations():
     annotations.visibility_left[[3, 9, 20, 33]] = 2
     sparse = labelled_images(replace(recording, truth=None, annotations=annotations), every=2)
     assert [one.name for one in sparse] == ["right 0", "left 9", "left 33"]  # every second of those that are labelled
-    with pytest.raises(ValueError, match=r"the recording has \['shaft', 'elbow', 'hook'\]; give a recording of a forceps"):
+    with pytest.raises(ValueError, match=r"landmarks are \['shaft', 'elbow', 'hook'\]; give one with \['base'"):
         next(iter(labelled_images(replace(recording, skeleton=("shaft", "elbow", "hook")))))
