@@ -46,6 +46,8 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
 
     Raises FileNotFoundError if there is no file, and ValueError if it is damaged, has no checksum or another format.
     """
+    if Path(path).is_dir():
+        raise IsADirectoryError(f"{path}: it is a folder; give the .safetensors file in it.")
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such weights file; train one with `python3 -m lib train`.")
     try:

@@ -183,9 +183,7 @@ class Detector:
         Raises FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or not a detector.
         """
         path = Path(path_or_name or "default")
-        if path.is_dir():
-            raise ValueError(f"{path}: it is a folder; give the .safetensors file in it.")
-        if path.name == str(path) and not path.suffix and not path.is_file():
+        if path.name == str(path) and not path.suffix and not path.exists():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):

@@ -26,7 +26,7 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
         Detector.load(tmp_path / "nothing.safetensors")
     with pytest.raises(FileNotFoundError, match=r"nowhere.default"):
         Detector.load(tmp_path / "nowhere" / "default")  # not the one that ships
-    with pytest.raises(ValueError, match=r"it is a folder; give the \.safetensors file in it"):
+    with pytest.raises(IsADirectoryError, match=r"it is a folder; give the \.safetensors file in it"):
         Detector.load(tmp_path)
     corrupt = tmp_path / "corrupt.safetensors"
     untrained().save(corrupt)
