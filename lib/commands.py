@@ -112,8 +112,10 @@ def main_reconstruct(argv: list[str]) -> int:
     now = with_offsets(data, offsets).of_frames(a.frame)
     tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
     if tool is None or not np.isfinite(tool).all():
-        text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
-        cure = "Choose another frame, or label this one and give --landmarks annotations."
+        text, cure = "The surface may include the tool: its mask needs base, tip_1 and tip_2.", "Compare it with the images."
+        if recording.skeleton == LANDMARKS:
+            text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
+            cure = "Choose another frame, or label this one and give --landmarks annotations."
         verdict = Verdict.join([verdict, Verdict((Reason("tool_not_masked", LEVELS[1], text, cure),))])
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
@@ -130,7 +132,8 @@ def main_reconstruct(argv: list[str]) -> int:
     found.rig.save(out / "refined_rig.json")  # refined by the matches
     few = a.setting == "quality" and len(found.u) < _FEW * (~found.mask_left).sum()
     hint = " These are few: --setting fast may be more accurate, as in smooth images." if few else ""
-    print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches.{hint}")
+    hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."
+    print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches. {hidden}{hint}")
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
 
@@ -186,13 +189,15 @@ def _results_of_rig(
         offset, turns = results["landmark_offsets_mm"], bool(results["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
         own = rig.name in ("rig.json", "moved_rig.json") and "recording" in results  # they are not about a refined rig
-        own, size = own and frame in range(*results["frames"]), tuple(results.get("image_size_px", image_size_px or ()))
+        own = own and frame in range(*results["frames"])
+        width, height = results.get("image_size_px", image_size_px or (0, 0))
         folder, verdict = results["recording"] if own else "", Verdict(tuple(Reason(**r) for r in results["reasons"] if own))
     except (ValueError, KeyError, TypeError) as error:
         what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
         raise ValueError(f"{what}; calibrate again, or move that file away.") from None
-    if image_size_px and size != tuple(image_size_px):
-        what = "its cameras are for images of {} x {} px, the recording has {} x {} px".format(*size, *image_size_px)
+    if image_size_px and (width, height) != tuple(image_size_px):
+        what = "the recording has {} x {} px".format(*image_size_px)
+        what = f"its cameras are for images of {width} x {height} px, {what}"
         raise ValueError(f"{paths.shown(rig)}: {what}; calibrate with images of this size.")
     unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
     return folder, verdict, None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)

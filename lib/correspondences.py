@@ -132,6 +132,11 @@ class Correspondences:
         pairs = zip((self.u_left, self.u_right), projected, self.seen.T, strict=True)
         return tuple(np.where(seen[:, None] | np.isnan(placed), u, placed) for u, placed, seen in pairs)
 
+    @property
+    def is_by_hand(self) -> bool:
+        """True if landmarks are seen and none has a covariance: labels that a person set."""
+        return bool(self.seen.any()) and not np.isfinite(self.covariance_px2).any()
+
     def check_detections(self) -> None:
         """Raise a `DataError` if an image shows fewer than four landmarks whose position the robot reports."""
         if len(self) < 4:
@@ -144,7 +149,7 @@ class Correspondences:
             what = f"the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows"
             cure = "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)"
             raise NoDetectionError(f"data: {what}; {cure}.")
-        if self.seen.any() and not np.isfinite(self.covariance_px2).any():  # labels set by hand
+        if self.is_by_hand:
             what = f"{left} landmarks are labelled in left images and {right} in right ones"
             raise NoDetectionError(f"data: {what}, and each camera needs four. Label ten pairs, far apart.")
         raise NoDetectionError(

@@ -37,6 +37,11 @@ def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.column_stack([A, y.mean(axis=0) - A @ mean])
 
 
+def camera_columns(x: np.ndarray, m: int) -> np.ndarray:
+    """(n, m, 4 m) derivatives of m pixel coordinates of points x (n, 3) by the entries of [A, t], row by row."""
+    return np.einsum("nj,ik->nikj", np.column_stack([x, np.ones(len(x))]), np.eye(m)).reshape(len(x), m, 4 * m)
+
+
 class AffineMinimum(NamedTuple):
     """The stacked cameras [A, t] as `matrix` (m, 4), and their energy `cost`."""
 

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.affine import regress
+from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
@@ -158,18 +158,19 @@ def tool_offsets(
         J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * q)
         Q = np.linalg.qr(np.column_stack([x - x.mean(axis=0), np.ones(len(x))]))[0]
         J -= np.tensordot(Q, np.tensordot(Q.T, J, axes=1), axes=1)
-        flat = J.reshape(-1, 3 * q)
-        step = np.linalg.lstsq(flat, r.ravel(), rcond=None)[0]
+        sigma_u, sigma_x = estimate_noise(r, matrix[:, :3], 4 * m + 3 * q)
+        noise_px2 = max(sigma_u, 1e-9) ** 2 * np.eye(m) + sigma_x**2 * matrix[:, :3] @ matrix[:, :3].T
+        root = np.linalg.inv(np.linalg.cholesky(noise_px2))  # the same for all rows, so it changes no camera
+        flat = (root @ J).reshape(-1, 3 * q)
+        step = np.linalg.lstsq(flat, (r @ root.T).ravel(), rcond=None)[0]
         offset = offset + step.reshape(q, 3)
         if np.abs(step).max() < 1e-9 * scale:
             break
     information = flat.T @ flat
     if np.linalg.cond(information) > 1e13:
         raise ValueError("robot_from_tool: the motion does not determine the offsets; turn the tool about two axes.")
-    precision = np.eye(m)[None] * max(r.size - 4 * m - 3 * q, 1) / max(float((r**2).sum()), 1e-20)
-    cameras = np.einsum("nj,ik->nijk", np.column_stack([x, np.ones(len(x))]), np.eye(m)).reshape(len(x), m, -1)
-    both = np.concatenate([J, cameras], axis=2)
-    covariance = sandwich(both, precision, r, matrix[None, :, :3], frame, landmark)[0][: 3 * q, : 3 * q].reshape(q, 3, q, 3)
+    both, weight = np.concatenate([J, camera_columns(x - x.mean(axis=0), m)], axis=2), np.linalg.inv(noise_px2)[None]
+    covariance = sandwich(both, weight, r, matrix[None, :, :3], frame, landmark)[0][: 3 * q, : 3 * q].reshape(q, 3, q, 3)
     # Check the covariance of the landmarks at each opening that occurs: a vector of little effect may have a large one.
     _check_determined(np.einsum("na,aibj,nb->nij", own, covariance, own))
     blocks = covariance[np.arange(k), :, np.arange(k)]

@@ -23,7 +23,8 @@ def sandwich(
     """Covariance (p, p) of estimates from rows of estimated noise level, and the equivalent number of independent rows.
 
     Args:
-        J, weight, r: (n, m, p) derivatives, (1 or n, m, m) inverse covariances, (n, m) residuals; zero where not seen.
+        J, weight, r: (n, m, p) derivatives, (1 or n, m, m) inverse covariances of the rows, which include the robot's noise,
+            and (n, m) residuals; zero where not seen.
         J_x: (1 or n, m, 3) derivatives by the robot's position.
         frame, landmark: (n,) of the rows, whose errors may be correlated; None: they are independent.
         prior: (p, p) Fisher information of a prior, 0 if there is none.
@@ -73,8 +74,9 @@ def _shared(
 ) -> np.ndarray:  # fmt: skip
     """What errors of the robot's position that the landmarks of a `frame` (n,) share add to the covariance of the scores.
 
-    The products of the residuals of two landmarks in a frame give the variance of these errors.  Their expectation allows for
-    the part of the errors that the fit absorbs, with the `known` covariance (p, p) of independent errors.
+    That is their covariance between two landmarks of a frame; `weight` contains that of a single landmark.  The products of
+    the residuals of two landmarks in a frame give the variance of these errors, at most what `weight` allows.  Their
+    expectation allows for the part that the fit absorbs, with the `known` covariance (p, p) of independent errors.
     """
     frames, place = np.unique(frame, return_inverse=True)
 
@@ -90,7 +92,8 @@ def _shared(
     product, expected = ((total(one) ** 2).sum() - (one**2).sum() for one in (pull, stiff))
     pairs = known @ np.tensordot(scores, others, axes=([0, 1], [0, 1]))
     expected += np.trace(pairs @ pairs) - 2 * np.einsum("nip,nij,njq,pq->", others, stiff, others, known, optimize=True)
-    variance_mm2 = (product + np.trace(pairs)) / max(expected, 1e-300)
+    most_mm2 = 1.0 / max(np.linalg.eigvalsh(stiff).max(), 1e-300)  # beyond it, landmarks would correlate by more than 1
+    variance_mm2 = min((product + np.trace(pairs)) / max(expected, 1e-300), most_mm2)
     if len(frames) < 2 or expected <= 0 or variance_mm2 <= 0:
         return np.zeros_like(known)
     gaps = np.diff(frames) / np.median(np.diff(frames))

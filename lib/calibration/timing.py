@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
 
-from lib.calibration.affine import estimate_noise, regress
+from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.offsets import further_step
 from lib.calibration.robust import NoConsensusError, consensus
@@ -178,7 +178,9 @@ def estimate_time_offset(
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
         raise DataError(f"search_s: the best offset has an error of {rms_px:.0f} px RMS; widen search_s.")
-    sd = np.sqrt(sandwich(derivative[:, :, None], W, r, A, frame, landmark)[0][0, 0]) / (1 - noise / information)
+    x = at(offset)
+    J = np.concatenate([derivative[:, :, None], used[:, :, None] * camera_columns(x - x.mean(axis=0), m)], axis=2)
+    sd = np.sqrt(sandwich(J, W, r, A, frame, landmark)[0][0, 0]) / (1 - noise / information)
     return TimeOffset(offset, float(sd), rms_px, trial, misfit)
 
 

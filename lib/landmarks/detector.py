@@ -183,8 +183,8 @@ class Detector:
         Raises FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or not a detector.
         """
         path = Path(path_or_name or "default")
-        if path.name == str(path) and not path.suffix and not path.exists():
-            path = paths.MODELS / f"{path.name}.safetensors"
+        named = paths.MODELS / f"{path}.safetensors"
+        path = named if path.name == str(path) and named.is_file() and not path.is_file() else path
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")

@@ -41,7 +41,7 @@ def match(
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
         min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong ones are below), else 0.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
-        budget_bytes: Memory that DeepMatching may use; a search that needs more, by prediction, is refused.
+        budget_bytes: Memory that "band" and "deepmatching" may use; a search that needs more, by prediction, is refused.
         max_epipolar_px: A rig is refused if the median distance of coarse free matches to its epipolar lines is larger.  With
             ``numpy.inf`` and a `depth_range_mm` there is no coarse pass: faster, for a rig that was checked before.
         reciprocal: Drop matches that fail the left-right check (mainly occlusions).

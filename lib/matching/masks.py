@@ -6,9 +6,9 @@ from numpy.typing import ArrayLike
 
 #: Square root of the area in px to which `dark_mask` reduces images, which averages noise.
 DARK_SIZE_PX = 360
-#: Dark and dim are levels below these parts of the bright areas' level; flat is a standard deviation below this part, in
-#: 7 x 7 px of the reduced image.  Pictures that fill the image have nothing dark and flat in the recordings that we have.
-DARK, DIM, FLAT = 0.125, 0.5, 0.01
+#: Dark and dim are levels below these parts of the bright areas' level; flat is a standard deviation below this part
+#: or 0.5, in 7 x 7 px of the reduced image; constant is a range (5 to 75 %) of an area's levels below this part or 1.
+DARK, DIM, FLAT, CONSTANT = 0.125, 0.5, 0.01, 0.02
 
 
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
@@ -24,10 +24,11 @@ def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
 
 
 def dark_mask(image: np.ndarray) -> np.ndarray:
-    """The surround of a round field, and other parts without light: dark and flat areas, their blurred rim, and a margin.
+    """The surround of a round field: dark areas of one level at the border of the image, their blurred rim, and a margin.
 
     Such a rim is at the same place in both images, so it would match itself.  Levels are relative to those of the bright
-    areas, so that a dim picture is not masked.  `image` as for `glint_mask`.
+    areas, so that a dim picture is not masked.  What a lamp hardly reaches is dark and flat, too, but not of one level.
+    `image` as for `glint_mask`.
     """
     height, width = image.shape[:2]
     factor = max(1, round(np.sqrt(height * width) / DARK_SIZE_PX))
@@ -37,8 +38,13 @@ def dark_mask(image: np.ndarray) -> np.ndarray:
     bright = (bright**2).sum() / max(bright.sum(), 1.0)
     level = cv2.blur(level, (3, 3))
     variance = cv2.blur(level**2, (7, 7)) - cv2.blur(level, (7, 7)) ** 2
-    flat = variance < (FLAT * bright) ** 2
+    flat = variance < max(FLAT * bright, 0.5) ** 2
     core = cv2.morphologyEx((flat & (level < DARK * bright)).view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5)))  # no specks
+    areas = cv2.connectedComponents(cv2.dilate(core, np.ones((15, 15))))[1]
+    for area in range(1, areas.max() + 1):
+        low, high = np.percentile(level[inside := areas == area], (5, 75))  # the rest may lie beyond the rim
+        at_border = inside[[0, -1]].any() or inside[:, [0, -1]].any()
+        core[inside] &= at_border and high - low < max(CONSTANT * bright, 1.0)
     soft = cv2.dilate(core, np.ones((31, 31))) & (level < DIM * bright).view(np.uint8)  # the blurred rim of the core, too
     grown = cv2.dilate(soft, np.ones((5, 5)))
     return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)

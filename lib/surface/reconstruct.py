@@ -164,7 +164,7 @@ def reconstruct(
         masks = {f"mask_{name}": glint_mask(image) | dark_mask(image) for name, image in (("left", left), ("right", right))}
         for side, (name, given) in enumerate((("mask_left", mask_left), ("mask_right", mask_right))):
             if masks[name].all():
-                raise ValueError(f"{name.removeprefix('mask_')}: the whole image is saturated or dark; change the exposure.")
+                raise ValueError(f"{name.removeprefix('mask_')}: the whole image is saturated; change the exposure.")
             if u_landmarks is not None:
                 masks[name] |= tool_mask(masks[name].shape, u_landmarks[side])
             if given is not None:

@@ -155,7 +155,7 @@ def judge(
         kinds = {NoDetectionError: "no_detection", CompetingCamerasError: "refused", NoConsensusError: "no_consensus"}
         name = next((name for kind, name in kinds.items() if isinstance(error, kind)), "refused")
         cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
-        if name == "refused":  # the error names its cure
+        if name == "refused" or (name == "no_detection" and data is not None and data.is_by_hand):  # the error names its cure
             few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
             cure = _MORE_FRAMES if few else "Correct that, then check again."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
@@ -358,10 +358,10 @@ def assess(
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
-    if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
+    if data.is_by_hand:
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        by_labels = ("detector_unfit", "minority", "no_consensus", "no_detection")  # the reasons that wrong labels cause
+        by_labels = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)

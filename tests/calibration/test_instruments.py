@@ -81,7 +81,8 @@ def test_time_offset_of_a_tool_that_hardly_moves_is_refused_or_vague(motion):
         except ValueError as error:
             refused += "hardly moves" in str(error) or "edge" in str(error)
     assert refused + len(distances) == 8 and (refused >= 7 if motion < 0.1 else refused == 0)
-    assert np.sqrt(np.mean(np.square(distances or [0]))) < 2.0
+    if motion == 0.1:
+        assert 0.4 < np.sqrt(np.mean(np.square(distances))) < 2.0
 
 
 def test_time_offset_with_missing_detections_and_several_landmarks():
@@ -313,7 +314,7 @@ def test_the_covariance_of_tool_offsets_holds_the_noise_of_the_poses():
         found = tool_offsets(reported, u)
         error = found.offset_mm - OFFSETS
         distances.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_mm2), error).mean() / 3)
-    assert 0.5 < np.mean(distances) < 1.8
+    assert 0.6 < np.mean(distances) < 1.6  # 6 if the errors of the poses are taken for independent errors of pixels
 
 
 def test_tool_offsets_name_what_is_wrong():

@@ -105,6 +105,18 @@ def test_covariance_allows_for_errors_that_the_landmarks_of_a_frame_share(shared
     assert np.mean(effective) < 100 if shared else np.mean(effective) > 115
 
 
+@pytest.mark.parametrize("frames", [4, 6, 12])
+def test_covariances_of_few_frames_with_large_shared_errors_are_covariances(frames):
+    """The variance of the shared error is estimated from few products; it must not exceed that of a row."""
+    for seed in range(15):
+        _, rig, x_mm = tool_sweep(seed, frames=frames, offset_mm=np.zeros((3, 3)))
+        rng, (frame, landmark) = np.random.default_rng(seed), np.divmod(np.arange(3 * frames), 3)
+        u = [p + rng.normal(0, 0.3, p.shape) for p in rig.project(x_mm)]
+        rows = Correspondences.of_points(x_mm + rng.normal(0, 0.1, (frames, 3))[frame], *u, frame=frame, landmark=landmark)
+        found = calibrate(rows, offsets=False, ransac_px=np.inf)
+        assert np.linalg.eigvalsh(found.parameter_covariance)[0] > 0
+
+
 def test_depth_map_grows_away_from_the_data():
     c, found = made(60, half_size_mm=(3, 2, 1))
     z = ROBOT_FROM_MICROSCOPE.apply(np.array([[0, 0, 0], [6, 0, 0], [6, 4, 0], [6, 4, 3.0]]))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from lib import paths
 from lib.landmarks import Detector
 from lib.landmarks.checkpoints import read_checkpoint, write_checkpoint
 from lib.landmarks.detector import FORMAT
@@ -21,11 +22,14 @@ def untrained(frame_px=64):
     return Detector(networks[0], frame_px, networks[1], error_models=models)
 
 
-def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
+def test_missing_corrupt_and_foreign_files_are_named(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
         Detector.load(tmp_path / "nothing.safetensors")
     with pytest.raises(FileNotFoundError, match=r"nowhere.default"):
         Detector.load(tmp_path / "nowhere" / "default")  # not the one that ships
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "default").mkdir()  # a folder of the name of weights
+    assert Detector.load().metadata == Detector.load(paths.MODELS / "default.safetensors").metadata
     with pytest.raises(IsADirectoryError, match=r"it is a folder; give the \.safetensors file in it"):
         Detector.load(tmp_path)
     corrupt = tmp_path / "corrupt.safetensors"

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.matching import dark_mask, glint_mask, tool_mask
+from lib.recordings import Recording
 
 
 def test_glints_are_saturated_in_every_channel_and_grown():
@@ -53,11 +55,20 @@ def test_the_blurred_rim_of_a_surround_is_masked():
     assert mask[field < 90].all() and mask[field > 250].mean() < 0.01
 
 
-def test_what_is_dark_and_textured_is_not_masked():
-    """A shadow, beside a bright part."""
+@pytest.mark.parametrize("sd", [6.0, 1.5])
+def test_what_is_dark_and_textured_is_not_masked(sd):
+    """A shadow, or what a lamp hardly reaches, beside a bright part."""
     image = textured_image(130, 25)
-    image[:, :240] = textured_image(15, 6)[:, :240]
+    image[:, :240] = textured_image(15, sd)[:, :240]
     assert dark_mask(image).mean() < 0.05
+
+
+@pytest.mark.parametrize("rest", [0.08, 0.12])
+def test_the_retina_beside_a_lit_disc_is_not_masked(rest):
+    image = Recording.open(paths.SHIPPED_RECORDING).frames[0].left
+    y, x = np.indices(image.shape[:2]) - np.reshape(image.shape[:2], (2, 1, 1)) / 2
+    lit = rest + (1.5 - rest) / (1 + np.exp((np.hypot(x, y) - 350) / 15))
+    assert dark_mask(np.clip(image * lit[..., None], 0, 240).astype(np.uint8)).mean() < 0.02
 
 
 def test_tool_covers_jaws_and_shaft():

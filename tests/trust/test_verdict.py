@@ -239,9 +239,12 @@ def test_no_detection_is_one_message():
     text = r"detector failed on 60 frames: of 60 .* found 60 in left images and 0 in right"
     with pytest.raises(NoDetectionError, match=text) as error:
         calibrate(nothing)
-    by_hand = replace(data, u_left=np.where(np.arange(60)[:, None] < 3, data.u_left, np.nan))
-    with pytest.raises(NoDetectionError, match="data: 3 landmarks are labelled in left images and 60 in right .* Label ten"):
-        calibrate(replace(by_hand, covariance_px2=np.full((60, 2, 2, 2), np.nan)))
+    few = np.where(np.arange(60)[:, None] < 3, data.u_left, np.nan)
+    by_hand = replace(data, u_left=few, covariance_px2=np.full((60, 2, 2, 2), np.nan))
+    what = "data: 3 landmarks are labelled in left images and 60 in right .* Label ten"
+    with pytest.raises(NoDetectionError, match=what) as told:
+        calibrate(by_hand)
+    assert "detector" not in judge(by_hand, None, error=told.value).reasons[0].cure
     verdict = judge(nothing, None, error=error.value)
     assert [reason.name for reason in verdict.reasons] == ["no_detection"] and verdict.is_red
     with pytest.raises(NoDetectionError, match="the robot reports a position for 0 of the 60 landmarks"):
