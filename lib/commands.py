@@ -89,7 +89,7 @@ def main_detect(argv: list[str]) -> int:
 def main_calibrate(argv: list[str]) -> int:
     """`python3 -m lib calibrate`: both cameras from landmarks and the robot; writes JSON, OpenCV YAML, ROS CameraInfo."""
     a, recording, out = _parsed("calibrate", main_calibrate, argv)
-    calibration, verdict, data = _calibrated(a, recording, out)
+    calibration, offsets, verdict, data = _calibrated(a, recording, out)
     if calibration is None:
         return 3
     print(report(calibration, verdict=verdict).removeprefix(f"{verdict}\n"))
@@ -98,18 +98,17 @@ def main_calibrate(argv: list[str]) -> int:
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
-    return _done(a, out, "calibration", numbers | _offsets_entries(calibration.offsets), verdict)
+    return _done(a, out, "calibration", numbers | _offsets_entries(offsets), verdict)
 
 
 def main_reconstruct(argv: list[str]) -> int:
     """`python3 -m lib reconstruct`: the surface in one stereo frame; writes GLB, PLY, a depth map, the rectified pair."""
     a, recording, out = _parsed("reconstruct", main_reconstruct, argv)
-    rig, verdict, data = _calibrated(a, recording, out)
+    rig, offsets, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
-    frame = recording.frames[a.frame]
-    pair, offsets = (rig.pair, rig.offsets) if isinstance(rig, Calibration) else (rig, _results_of_rig(a.rig)[2])
-    now = with_offsets(data, offsets).of_frames(a.frame)
+    frame, now = recording.frames[a.frame], with_offsets(data, offsets).of_frames(a.frame)
+    pair = rig.pair if isinstance(rig, Calibration) else rig
     tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
     if tool is None or not np.isfinite(tool).all():
         text, cure = "The surface may include the tool: its mask needs base, tip_1 and tip_2.", "Compare it with the images."
@@ -275,13 +274,12 @@ def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None
 
 def _calibrated(
     a: argparse.Namespace, recording: Recording, out: Path
-) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
-    """The calibration (None if refused) or the rig of --rig; the verdict; the landmarks."""
-    given = getattr(a, "rig", None)  # with a rig, only the frame's landmarks are needed, to mask the tool
-    if given:  # first, since the detector takes its time
-        rig, (folder, verdict, _) = StereoRig.load(given), _results_of_rig(given, a.frame, recording.image_size_px)
-    data = _data(a, recording, np.array([a.frame]) if given else None)
-    if given:
+) -> tuple[Calibration | StereoRig | None, LandmarkOffsets | None, Verdict, Correspondences]:
+    """The calibration (None if refused) or the rig of --rig; its landmarks' offsets; the verdict; the landmarks."""
+    if given := getattr(a, "rig", None):
+        # A wrong rig is refused before the detector takes its time.  Only the frame's landmarks are needed, for the mask.
+        rig, (folder, verdict, offsets) = StereoRig.load(given), _results_of_rig(given, a.frame, recording.image_size_px)
+        data = _data(a, recording, np.array([a.frame]))
         if folder != str(recording.folder.resolve()):
             text = f"{given}: nothing here shows that this rig fits this frame."
             same = [f"--{name}={value}" for name in ("weights", "landmarks") if (value := getattr(a, name, None))]
@@ -289,9 +287,10 @@ def _calibrated(
             cure = f"Run: {register}; then give the moved_rig.json that it writes as --rig."
             verdict = Verdict((Reason("rig_given", LEVELS[1], text, cure),))
     else:
+        data = _data(a, recording)
         found = _assessed(a, recording, data)
-        rig, verdict = found.calibration, found.verdict
-    return None if _refused(a, out, verdict, rig is not None) else rig, verdict, data
+        rig, verdict, offsets = found.calibration, found.verdict, found.calibration and found.calibration.offsets
+    return None if _refused(a, out, verdict, rig is not None) else rig, offsets, verdict, data
 
 
 def _refused(a: argparse.Namespace, out: Path, verdict: Verdict, found: bool = True) -> bool:

@@ -220,7 +220,7 @@ def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, cap
 
     def verdict(rig, force=False):
         a = SimpleNamespace(rig=rig, recording=recording.folder, frame=0, landmarks="annotations", force=force, earlier={})
-        found, told, _ = commands._calibrated(a, recording, tmp_path)
+        found, _, told, _ = commands._calibrated(a, recording, tmp_path)
         return found is not None, told.level, [reason.name for reason in told.reasons]
 
     assert verdict(out / "rig.json") == (True, told["verdict"], [reason["name"] for reason in told["reasons"]])

@@ -59,7 +59,7 @@ def sandwich(
 
 
 def _correlated(K: np.ndarray, gaps: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) of the sum of scores K (n, c, p); a `share` of the errors decays with each correlation over gaps."""
+    """Covariance (p, p) of the sum of the scores K (n, c, p) of successive rows; `share` weights each of `_CORRELATIONS`."""
     decay = _CORRELATIONS[:, None] ** gaps
     past = np.tile(K[:, None], (1, len(share), 1, 1))  # for each row: the sum of the rows up to it, with decayed weights
     for before, now, kept in zip(past[:-1], past[1:], decay.T[:, :, None, None], strict=True):

@@ -22,7 +22,7 @@ _SMOOTH_S = 0.1  # the robot's motion is smooth within this time
 #: A minimum of the misfit is clear if it is this far below the median trial in each camera; then landmarks may have constant
 #: offsets.  The second number is the largest residual with such offsets, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
-_MOTION = 1.3  # least information of the velocities on the offset, in units of what the log's noise alone seems to give
+_MOTION = 1.3  # least ratio of the information in the velocities to that which the log's noise alone would seem to hold
 
 
 @dataclass(frozen=True, eq=False)

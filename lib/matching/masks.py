@@ -6,8 +6,9 @@ from numpy.typing import ArrayLike
 
 #: Square root of the area in px to which `dark_mask` reduces images, which averages noise.
 DARK_SIZE_PX = 360
-#: Dark and dim are levels below these parts of the bright areas' level; flat is a standard deviation below this part
-#: or 0.5, in 7 x 7 px of the reduced image; constant is a range (5 to 75 %) of an area's levels below this part or 1.
+#: Limits of `dark_mask`, relative to the level of the bright areas.  A surround is darker than DARK, its rim than DIM.  It is
+#: flat: the standard deviation in 7 x 7 px is below FLAT.  It has one level: the 5th and 75th percentiles differ by less than
+#: CONSTANT.  Noise allows no less than 0.5 and 1 grey values for these two.
 DARK, DIM, FLAT, CONSTANT = 0.125, 0.5, 0.01, 0.02
 
 

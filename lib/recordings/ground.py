@@ -32,8 +32,8 @@ class Ground:
         """The median of those frames of a recording (`name`) between which the robot's tool x_mm (n, k, 3) moves farthest.
 
         If the robot reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred.
-        None if fewer than five frames show the tool in different places: it would become part of the ground, and its place
-        would then look like a tool in frames that do not show it there.
+        None if fewer than five frames show the tool in different places.  The ground would then contain the tool, and frames
+        that do not show it there would seem to.
         """
         chosen = apart(x_mm.mean(axis=1), _FRAMES, _APART * _length(x_mm))
         if len(chosen) < _FEWEST:
