@@ -300,14 +300,14 @@ def test_a_refuted_calibration_gives_no_distances_when_the_robot_errs_either():
     assert not any(measured(run(pipeline, world, 1)))
 
 
-def late_from_the_start(seed: int, late: int, n: int):
+def late_from_the_start(seed: int, late: int, n: int, settings: Settings = SELDOM):
     """Results, and errors of the distances in mm, if the report of a turning tool is late by one frame in `late` frames."""
     world, t = World(seed), np.arange(n) / 25.0
     turn = Rotation.from_rotvec(np.sin(np.outer(t, [1.9, 2.6, 1.3]) + seed) * [0.4, 0.3, 0.5]).as_matrix()
     place = CENTRE_MM + np.sin(np.outer(t, [1.6, 2.3, 3.1]) + seed) * [3.0, 2.0, 1.0]
     tool = np.array([[0.0, 0.0, 0.0], [4.0, 0.8, 1.0], [4.0, -0.8, 1.0]])
     world.x_mm = tool @ (turn @ ROBOT_FROM_MICROSCOPE.R).mT + place[:, None]
-    pipeline, told, results, error_mm = make(world, settings=SELDOM), [], [], []
+    pipeline, told, results, error_mm = make(world, settings=settings), [], [], []
     for i in range(n):
         told.append(world.advance())
         results.append(pipeline.step(*world.images, told[-2] if 0 < i < late else told[-1]))
@@ -325,9 +325,9 @@ def test_a_doubtful_calibration_is_no_plain_tracking():
 
 
 def test_a_calibration_that_more_frames_refute_gives_no_distances_and_is_made_anew():
-    results, error_mm = late_from_the_start(7, 100, 230)
-    assert any(measured(results[:40])) and not any(measured(results[40:100]))
-    assert all("the calibration is not trustworthy" in r.cause for r in results[40:100])
+    results, error_mm = late_from_the_start(7, 60, 140, replace(SELDOM, calibration_frames=(8, 40)))
+    assert any(measured(results[:30])) and not any(measured(results[30:60]))
+    assert all("the calibration is not trustworthy" in r.cause for r in results[30:60])
     assert all(r.state == "tracking" and not r.cause for r in results[-20:])
     assert np.abs(error_mm[-20:]).max() < 0.1
 
