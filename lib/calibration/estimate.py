@@ -284,8 +284,8 @@ def _calibrate(
         if refuse.eyes_exchanged(found.rig.linear, sd_rad):
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
             what = f"the cameras are swapped, the left one is {degrees:.1f} degrees to the right of the right one"
-            cure = "exchange u_left and u_right (if mirrored flip both images, or one axis of x_mm; if upside down turn both)"
-            raise DataError(f"u: {what}; {cure}.  checks=False takes them as they are.")
+            cure = "exchange left and right images (if mirrored flip both, or one axis of x_mm; if upside down turn both)"
+            raise DataError(f"u: {what}; {cure}.")
     return found
 
 

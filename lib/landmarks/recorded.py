@@ -15,6 +15,8 @@ from lib.correspondences import Correspondences, of_recording
 from lib.landmarks.detector import Detector, Landmarks
 from lib.recordings import Ground, GrowingGround, Recording
 
+_ANY_GROUND = "any"  # in place of the ground's key, if the detector was sure and did not ask for it
+
 
 def detect(
     recording: Recording, detector: Detector | None = None, *, frames: slice | np.ndarray | None = None, track: bool = False
@@ -65,7 +67,8 @@ class SharedDetector:
 
     An environment variable set by `python3 -m lib` names the folder: `run` makes its own and removes it at its end, other
     commands use one in data/cache.  Without it nothing is cached.  A file's name is the digest of the images' pixels, the
-    ground's key, the weights, the settings and the engine.  To measure times, call the detector itself.
+    weights, the settings, the engine, and if the detector asked for the ground, its key.  To measure times, call the
+    detector itself.
 
     Attributes:
         seconds: Time that the detections took, in s; for those read from the cache, the time when they were made.
@@ -84,20 +87,26 @@ class SharedDetector:
 
     def __call__(self, images: np.ndarray, *, ground: Ground | None = None) -> Landmarks:
         """Detect the landmarks of a stereo pair (2, h, w, 3), uint8 RGB; `ground` as in a `Detector`'s call."""
-        self.pairs, file = self.pairs + 1, None
-        if self._folder:
-            content = f"{self._digest} {images.dtype} {images.shape} {ground and ground.key}".encode() + images.tobytes()
-            file = Path(self._folder) / f"{files.digest(content, length=64)}.npz"
-            with suppress(OSError, ValueError, EOFError, KeyError, BadZipFile), np.load(file) as cached:  # else detect again
+        self.pairs, pixels, asked = self.pairs + 1, images.tobytes() if self._folder else b"", []
+
+        def file(of_ground: str) -> Path:
+            content = f"{self._digest} {images.dtype} {images.shape} {of_ground}".encode() + pixels
+            return Path(self._folder) / f"{files.digest(content, length=64)}.npz"
+
+        key = str(ground and ground.key)
+        for path in (file(_ANY_GROUND), file(key)) if self._folder else ():
+            with suppress(OSError, ValueError, EOFError, KeyError, BadZipFile), np.load(path) as cached:  # else detect again
                 found, seconds = Landmarks(cached["u"], cached["covariance"], cached["confidence"]), float(cached["seconds"])
                 self.read, self.seconds = self.read + 1, self.seconds + seconds
                 return found
         start = time.perf_counter()
-        found = self.detector(images, **({"ground": ground} if isinstance(self.detector, Detector) else {}))
+        noted = ground and (lambda: asked.append(True) or ground())
+        found = self.detector(images, **({"ground": noted} if isinstance(self.detector, Detector) else {}))
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        if file:
-            with suppress(OSError), files.whole(file) as partial:  # a full disk must not stop a notebook
+        if self._folder:
+            path = file(_ANY_GROUND if ground and not asked else key)
+            with suppress(OSError), files.whole(path) as partial:  # a full disk must not stop a notebook
                 np.savez(partial, **vars(found), seconds=seconds)
         return found
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector
 from lib.online.feeds import Live, Recorder, recorded
 from lib.online.pipeline import OnlinePipeline
@@ -71,6 +72,9 @@ def main(argv: list[str] | None = None) -> int:
     if min(a.surface_every, 1 if a.frames is None else a.frames) < 1:
         parser.error("--frames and --surface-every: must be at least 1.")
     recording = Recording.open(a.recording)
+    if recording.skeleton != LANDMARKS:
+        names = ", ".join(recording.skeleton)
+        raise ValueError(f"{a.recording}: its landmarks are {names}; the online system follows {', '.join(LANDMARKS)}.")
     settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
     detector = Detector.load(a.weights)
     frames = recorded(recording, a.frames)

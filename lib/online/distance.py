@@ -15,7 +15,7 @@ from lib.online.result import FrameResult, Settings
 from lib.online.tracker import RigTracker
 from lib.surface import Reconstruction
 
-_WALK_MM = 0.005  # random walk of the correction, per square root of a second
+_WALK_S = 1.0  # in this time the correction's random walk grows as far as eye or cameras may move (`Settings.eye_mm_s`)
 _SMOOTH_S = 0.2  # time constant over which the robot's velocity is averaged
 _SILENT_S = 0.5  # after a longer gap without a report the velocity is unknown
 
@@ -102,7 +102,8 @@ class TipDistance:
 
     def _predict(self, time_s: float, x_mm: np.ndarray) -> None:
         if np.isfinite(self._time) and time_s > self._time:
-            self._covariance = np.minimum(self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3), 1.0)
+            walk_mm2 = self.settings.eye_mm_s**2 * _WALK_S * (time_s - self._time)
+            self._covariance = np.minimum(self._covariance + walk_mm2 * np.eye(3), 1.0)
         step_s = time_s - self._moved_s
         known = (step_s > 0) & ((step_s <= _SILENT_S) | (self._moved_s == self._time))  # or in the frame before
         self._time = time_s

@@ -44,7 +44,9 @@ class OnlinePipeline:
         detector: `lib.landmarks.Detector`, or any function of images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
             and `.confidence`.  Methods `track` and `near`, if any, follow the tool and search near the robot's report.
             The memory of the images is used again for the next frame: a detector that keeps them must copy them.
-        rig: A rig or a calibration to start from, kept until the cameras move; None calibrates from the first frames.
+        rig: A calibration to start from, kept until the cameras move; None calibrates from the first frames.  A `StereoRig`
+            has no covariance and no landmark offsets: the distances' standard deviations lack its errors, which each frame
+            states as a doubt.
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` without a calibration.
         beside: Reconstruct surfaces in a separate process, the newest frame first; otherwise within `step`, which gives
             the same output for the same input.  Use the pipeline in a ``with`` block, which ends the process.
@@ -172,6 +174,8 @@ class OnlinePipeline:
             state, cause = "unseen", "no landmarks"
         elif measures and bad_report:
             state, cause = "robot", bad_report
+        elif not seen:
+            cause = cause or "no landmarks"
         result.state, result.cause = state, cause or doubt
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:

@@ -45,7 +45,8 @@ class Settings:
         control: Control points of the surface (n_x, n_y).
         fps: Frames per second, for frames without a time stamp.
         stale_s: Largest age of the surface, and of the last detection of landmarks, for which distances are given.
-        eye_mm_s: Speed at which eye and cameras may move unseen, by which the distance's standard deviation grows.
+        eye_mm_s: Speed at which eye and cameras may move unseen, by which the distance's standard deviation grows.  The
+            faster, the less the distance trusts the robot's earlier reports.
         slip_mm: Standard deviation of the landmarks' offset from the robot's report, in addition to its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
         alarm_mm, miss_rate: A tip is `too_close` if its distance may be below alarm_mm.  A tip that truly is below is missed

@@ -26,6 +26,10 @@ _FAR_MM = 200.0  # no tool reaches farther from the robot's median position
 _STILL_PX, _NOISE_PX, _TIMES = 3.0, 1.0, 3.0
 _PATIENT = 5  # factor on `Settings.give_up_frames` while the scene stands still
 _PAST = 40  # frames kept to find a late report
+_UNCALIBRATED = Reason(
+    "no_covariance", LEVELS[1], "The cameras were given without a calibration; no standard deviation contains their errors.",
+    "Give the Calibration that `lib.calibration.calibrate` returns.",
+)  # fmt: skip
 _AGAIN = 30  # frames after a registration in which no microscope moves again; a new motion refutes the registration
 
 
@@ -54,6 +58,7 @@ class RigTracker:
         self._given = rig is not None
         if rig is not None:
             self._use(rig)
+            self.verdict = Verdict(() if self.calibration else (_UNCALIBRATED,))
 
     def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
         """Drop the rig: at the start, and when the images show other optics or nothing explains them."""

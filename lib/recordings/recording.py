@@ -38,6 +38,9 @@ _ORDER = "time_s must be a number, larger than in the row before"
 _LONGER = 5.0  # if a log is longer than its video by this factor, the times of the frames may be missing
 _COVERED = 0.75  # fewest frames with a position, as a share; with fewer, log and video do not belong together
 _JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgical robot is faster
+#: Longest usual time for which a log may repeat a position; the fewest different positions, and their least usual distance in
+#: units of the robot's accuracy, from which it is known.
+_HELD_S, _FEWEST_NEW, _STEPS = 0.015, 10, 3.0
 _SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
@@ -186,6 +189,10 @@ class Recording:
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
+        new = np.flatnonzero((moved_mm != 0).any(axis=1))  # NaN is not 0
+        steps = len(new) > _FEWEST_NEW and np.median(jump_mm[new]) > _STEPS * self.robot_accuracy_mm  # else it is a fine grid
+        held_s = float(np.median(np.diff(log_s[new]))) if steps else 0.0
+        repeats = held_s > max(_HELD_S, 1.5 * usual_s)
         videos = [] if (self.folder / "frames.csv").exists() else self.folder.glob("*.mp4")
         stated = [video_times(path) for path in videos if path.stem in SIDES]
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
@@ -193,6 +200,9 @@ class Recording:
         cases = (
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in seconds? Log ten samples a second or more."),
+            (repeats, "repeated_samples",
+             f"kinematics.csv has a row every {usual_s:.3g} s, but usually a new position only every {held_s:.3g} s.",
+             "Keep the first of each run of equal rows: the robot was there then, and not later."),
             (late_s > 0.5 / self.fps, "video_times", f"The videos' times are {late_s:.3g} s off those of fps = {self.fps:g}.",
              "Set fps to the videos' rate, or if it varies, write the times of their frames to frames.csv (frame, time_s)."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",

@@ -129,6 +129,7 @@ def _next(recording: Recording, a: Assessment, frames: range) -> str:
     """The next step, in words.  Wrong time stamps come first where there is no calibration or no specific cause."""
     best = a.diagnosis.best
     unspecific = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
+    unspecific |= any(doubt.name == "repeated_samples" for doubt in recording.doubts)
     if unspecific and a.verdict.is_red and recording.mistimed:
         return recording.mistimed
     if a.verdict.level != LEVELS[0]:

@@ -65,7 +65,7 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
     if not own.any():  # the gain comes from better cameras than those of `null`
         return
-    text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
+    text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames, first in frame {problem.number[own.argmax()]}."
     cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
     raw = fit.total - case.null.total - case.frames * np.log(2.0)
     yield case.found("tip_order", fit, 1, (100 * own.mean(), 0.0, "%"), text, cure, on=moved, raw=raw)

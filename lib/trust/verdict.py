@@ -70,6 +70,7 @@ _LABEL_PX = 3.0
 #: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
+_BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
@@ -150,7 +151,8 @@ def judge(
         text = best.text
         if best.evidence is not None and best.name != "landmark_offset":
             text += f" It explains {100 * best.explained:.0f} % of the residuals."
-        found += _reason("diagnosis", best.explained, text, best.cure, best.name)
+        repeats = [doubt.cure for doubt in doubts if doubt.name == "repeated_samples" and best.name in _BY_REPEATS]
+        found += _reason("diagnosis", best.explained, text, *(repeats or [best.cure]), best.name)
     if calibration is None:
         kinds = {NoDetectionError: "no_detection", CompetingCamerasError: "refused", NoConsensusError: "no_consensus"}
         name = next((name for kind, name in kinds.items() if isinstance(error, kind)), "refused")

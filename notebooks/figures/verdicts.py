@@ -29,6 +29,7 @@ _OF_FEW = ("few_frames", "few_rows", "coverage", "cross_validation")
 #: Reasons that mean too little motion; uncertain cameras (from too little motion or from any other cause); wrong times.
 _MOTION, _UNSURE = ("few_frames", "one_line", "one_plane", "thin"), ("coverage", "few_rows", "cross_validation")
 _TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "video_times", "frame_times", "little_overlap", "slow_log")
+_TIMES += ("repeated_samples",)
 #: Reasons that point to the detector, if the diagnosis names no cause.
 _LOST = ("no_detection", "no_consensus", "minority")
 #: Fewest and most stereo frames to label: fewer teach little, and more are rarely needed.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.landmarks import Landmarks, SharedDetector
+from lib.landmarks import Detector, Landmarks, SharedDetector
 from lib.recordings import Ground
 
 
@@ -53,6 +53,24 @@ def test_another_image_or_ground_or_detector_is_looked_at_anew(shared, change):
     again = SharedDetector(Counting("b" if change == "detector" else "a", 5.0))
     ground = Ground(lambda: PAIR, "another") if change == "ground" else None
     assert again(other, ground=ground).u[0, 0, 0] == 5.0 and again.read == 0
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_another_ground_counts_only_if_the_detector_asked_for_it(shared, asks):
+    class InDoubt(Detector):
+        digest = "a"
+
+        def __init__(self):
+            """No networks."""
+
+        def __call__(self, images, ground):
+            return Counting(x=float(ground().max()) if asks else 3.0)(images)
+
+    grounds = [Ground(lambda n=n: np.full((2, 8, 6, 3), n, np.uint8), f"ground {n}") for n in (1, 2)]
+    detectors = [SharedDetector(InDoubt()) for _ in grounds]
+    found = [one(PAIR, ground=ground).u[0, 0, 0] for one, ground in zip(detectors, grounds, strict=True)]
+    assert found == ([1.0, 2.0] if asks else [3.0, 3.0]) and detectors[1].read == (0 if asks else 1)
+    assert SharedDetector(InDoubt())(PAIR, ground=grounds[1]).u[0, 0, 0] == found[1]
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", bytes(200)])

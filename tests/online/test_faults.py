@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
@@ -505,3 +506,16 @@ def test_two_places_that_no_tool_reaches_from_each_other_are_named():
     world.x_mm[4:] += 400.0  # mm, in each coordinate; the jump is believed after ten frames
     results = run(make(world, settings=SELDOM), world, 18)
     assert "too far apart" in results[-1].failures["calibrate"]
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_cameras_that_creep_along_the_view_as_fast_as_is_allowed_hardly_harm(sign):
+    """Nothing shows it, but the distances must not be stated as more certain than they are."""
+    world, pipeline = calibrated(100, smooth=True)
+    scores = []
+    for i in range(150):
+        world.rig = shifted(RIG, sign * SELDOM.eye_mm_s * i / 25.0 * VIEW)
+        result = run(pipeline, world, 1)[0]
+        scores.append((result.distance_mm - world.true_distance_mm()) / result.distance_sd_mm)
+    assert np.isfinite(scores).mean() > 0.9 and (np.array(scores) > -ndtri(SELDOM.miss_rate)).mean() < 0.02
+    assert np.nanstd(scores) < 1.3

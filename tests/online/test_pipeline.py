@@ -125,7 +125,7 @@ def test_without_kinematics_the_rig_still_measures():
     result = pipeline.step(*world.images)
     assert np.isfinite(result.x_tool_mm).all()
     assert np.isfinite(result.distance_mm).all()
-    assert not result.failures
+    assert result.failures == {"calibrate": "the calibration is doubtful: no_covariance"}  # of the rig that was given
 
 
 @pytest.mark.parametrize(

@@ -699,6 +699,21 @@ def test_doubts(frames, times, jump, name):
     assert bool(recording.mistimed) == (name not in (None, "jump"))
 
 
+@pytest.mark.parametrize(("held", "grid_mm", "named"), [(5, 0.0, True), (1, 0.0, False), (1, 0.02, False), (1, 0.5, True)])
+def test_a_log_that_repeats_its_positions_is_in_doubt(held, grid_mm, named):
+    """A slow robot and a fast logger, or a coarse grid; a fine one does no harm.  Rests count little."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    log = recording.kinematics
+    x = log.x_mm[np.arange(len(log.x_mm)) // held * held]
+    x = np.round(x / grid_mm) * grid_mm if grid_mm else x
+    x[100:400] = x[100]
+    recording = replace(recording, kinematics=Kinematics(log.time_s, x))
+    assert [doubt.name for doubt in recording.doubts] == ["repeated_samples"] * named
+    if held > 1:
+        assert "a row every 0.01 s, but usually a new position only every 0.05 s" in recording.mistimed
+        assert "Keep the first of each run of equal rows" in recording.mistimed
+
+
 @pytest.mark.parametrize("times", [np.arange(30) / 50, np.cumsum(np.where(np.arange(30) % 10 == 9, 0.4, 0.04))])
 def test_a_video_whose_times_are_not_those_of_fps_is_in_doubt(times, tmp_path):
     """Without frames.csv the times in the videos are not read, so that another or a variable rate would be missed."""

@@ -14,7 +14,7 @@ from lib.correspondences import Correspondences, DataError, NoDetectionError, of
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Doubt, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from lib.trust import LEVELS, Health, Reason, Verdict, assess, diagnose, judge
+from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, judge
 from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies import spoiling
@@ -267,3 +267,11 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
     names = [r.name for r in assess(recording, replace(data, x_mm=x_mm)).verdict.reasons]
     assert "camera_moved" in names and "robot_jumped" not in names
+
+
+@pytest.mark.parametrize(("name", "cure"), [("time_stamps", "Keep the first rows."), ("camera_moved", "Do not round.")])
+def test_a_log_that_repeats_its_positions_is_mended_before_the_times(name, cure):
+    found = Hypothesis(name, "It errs.", "Do not round.", 23.0, 1.0, "ms", explained=0.9, gain=100.0)
+    doubt = Doubt("repeated_samples", "It repeats.", "Keep the first rows.")
+    verdict = judge(None, None, diagnosis=Diagnosis((found,)), error=DataError("no."), doubts=[doubt])
+    assert next(reason.cure for reason in verdict.reasons if reason.name == name) == cure
