@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from lib import files, paths
 from lib.parallel import cores
@@ -39,12 +40,10 @@ def commit_id() -> str:
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
     processor = platform.processor() or platform.machine()
-    memory_gb = gpu = None
+    memory_gb, gpu = round(psutil.virtual_memory().total / 1e9, 1), None
     with suppress(OSError):  # not Linux
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
-    with suppress(AttributeError, ValueError, OSError):  # Windows
-        memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     with suppress(OSError, subprocess.SubprocessError, IndexError):  # no driver, no answer, or no GPU
         names = subprocess.run(_GPU_NAMES, capture_output=True, text=True, timeout=20, check=True).stdout
         gpu = names.splitlines()[0].strip()

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
+from tqdm.auto import tqdm
 
 from lib.calibration.offsets import OWN_BIAS
 from lib.correspondences import Correspondences, of_recording
@@ -75,16 +76,17 @@ class Seen(NamedTuple):
 
 
 def look(
-    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
-    progress: Callable[[float], None] = lambda done: None,
-) -> Seen:  # fmt: skip
-    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search only there."""
+    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None, title: str = ""
+) -> Seen:
+    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search only there.
+
+    A progress bar is shown if it has a `title`.
+    """
     found, known = [], with_ground(detector, recording)
-    for i, number in enumerate(frames):
+    for i, number in enumerate(tqdm(frames, desc=title, unit="pair", disable=not title)):
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])
         found.append(detector(pair, **known) if near is None else detector.near(pair, near[i], reach=NEAR, **known))
-        progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
 
 
@@ -115,17 +117,13 @@ def exchanged_tips(seen: Seen, labels: Seen) -> bool:
     return bool(sure.sum() >= _FEWEST_IMAGES and (crossed < 0.5 * straight)[sure].mean() > 0.8)
 
 
-def look_elsewhere(
-    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
-    progress: Callable[[float], None] = lambda done: None,
-) -> Seen:  # fmt: skip
+def look_elsewhere(recording: Recording, detector: Callable, seen: Seen, still: np.ndarray, *, title: str = "") -> Seen:
     """A copy of `seen`; tools that are `still` (m, 2) are detected again, only where images differ from the ground."""
     images = np.argwhere(still if recording.ground is not None else np.zeros_like(still))
     found = Seen(*(part.copy() for part in seen))
-    for k, (i, side) in enumerate(images):
+    for i, side in tqdm(images, desc=title, unit="image", disable=not title):
         frame = recording.frames[int(seen.frame[i])]
         other = detector(levelled((frame.left, frame.right)[side], recording.ground()[side])[None])
         for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
             part[i, side] = one[0]
-        progress((k + 1) / len(images))
     return found

@@ -214,13 +214,8 @@ class _Work:
         self.report |= {"notes": [], "rounds": []}
 
     @property
-    def left_s(self) -> float:
-        return 60 * self.minutes - (time.perf_counter() - self.began)
-
-    def say(self, text: str, done: float) -> None:
-        if self.progress:
-            line = f"\r{text}: {100 * done:3.0f} %, at most {max(self.left_s, 0) / 60:.1f} min of training left "
-            print(line, end="" if done < 1 else "\n", file=sys.stderr, flush=True)
+    def left_min(self) -> float:
+        return max(self.minutes - (time.perf_counter() - self.began) / 60, 0.0)
 
     def finished(self) -> dict:
         """The report with its provenance."""
@@ -246,7 +241,7 @@ class _Work:
         """Detections by `find`, or those that an earlier call kept under this name."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            found = find(progress=partial(self.say, f"Detecting ({name})"))
+            found = find(title=f"Detecting ({name}), at most {self.left_min:.1f} min of training left" * self.progress)
             with files.whole(path) as new:
                 np.savez(new, **found._asdict())
         with np.load(path) as kept:
@@ -325,7 +320,7 @@ class _Work:
         self.simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
         for k in range(1, ROUNDS + 1):
             begun = (self.folder / f"round {k}").is_dir()  # before a kill
-            if k > 1 and not begun and self.left_s < 6 * self.minutes:
+            if k > 1 and not begun and self.left_min < 0.1 * self.minutes:
                 break
             tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
             seen, refusal = self.look(f"round {k}", tuned, self.frames), {}
@@ -414,14 +409,17 @@ class _Work:
         def progress(stage: str, part: float) -> None:
             done[stage] = part
             shares = ", ".join(f"{name} {100 * one:.0f} %" for name, one in sorted(done.items()))
-            self.say(f"Round {k} ({shares})", min(sum(done.values()) / len(detector.networks), 1.0))
+            share = min(sum(done.values()) / len(detector.networks), 1.0)
+            if self.progress:
+                line = f"\rRound {k} ({shares}): {100 * share:3.0f} %, at most {self.left_min:.1f} min of training left "
+                print(line, end="" if share < 1 else "\n", file=sys.stderr, flush=True)
             if time.perf_counter() - self.saved_s > 30:  # so that a kill loses little of the time count
                 self.saved_s = time.perf_counter()
                 files.write_json(self.folder / "state.json", {"seconds": self.saved_s - self.began})
 
         tuned = self.tune(
             detector, images, held_out, self.folder / f"round {k}", simulated=self.simulated, steps=STEPS, seed=self.seed,
-            minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), progress=progress,
+            minutes=max(self.left_min * _ROUND_SHARE, 0.05), progress=progress,
         )  # fmt: skip
         if self.learns:
             tuned.save(path)

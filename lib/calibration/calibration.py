@@ -293,7 +293,7 @@ class OnlineCalibration:
         y, J_x, J = self._state.evaluate(x)
         r = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0)
         S = noise + variance_x * J_x @ J_x.mT
-        used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100, 2)  # with the rig's uncertainty
+        used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100)  # with the rig's uncertainty
         if used.any():
             W = precision(S, used)
             # Take the derivatives at the corrected points, as in `fit`; at the noisy points they would bias the depth.

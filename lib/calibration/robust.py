@@ -9,7 +9,7 @@ forward search starts from the half of the rows that agrees best and adds one ro
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtri, gammainccinv
+from scipy.special import fdtri
 
 from lib.calibration.affine import regress
 from lib.correspondences import DataError
@@ -43,9 +43,9 @@ class CompetingCamerasError(NoConsensusError):
     """Some rows agree on one camera, and as many others on another one."""
 
 
-def gate(n: int, m: int) -> float:
-    """Largest squared Mahalanobis distance of an inlier, exceeded in 1 of 10 000 data sets of n rows of m coordinates."""
-    return float(2.0 * gammainccinv(m / 2, FALSE_ALARM / n))
+def gate(n: int) -> float:
+    """Largest squared Mahalanobis distance of an inlier in an image, exceeded in 1 of 10 000 data sets of n rows."""
+    return float(2.0 * np.log(n / FALSE_ALARM))  # a quantile of chi-square with 2 degrees of freedom
 
 
 def consensus(
@@ -152,7 +152,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
     matrix = regress(x[keep], u[keep])
     r = u[keep] - x[keep] @ matrix[:, :3].T - matrix[:, 3]
     sigma = float(np.sqrt((r**2).sum() / max(r.size - 8, 2)))
-    return _Found(np.isin(np.arange(n), keep), matrix, sigma, np.inf, gate(n, 2))
+    return _Found(np.isin(np.arange(n), keep), matrix, sigma, np.inf, gate(n))
 
 
 def _extent(u: np.ndarray) -> np.ndarray:
@@ -242,7 +242,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
         best = 0
     sigma, wider = scales[best].tolist()
     share = share[best]
-    gate2 = gate(n, 2)
+    gate2 = gate(n)
     if wider > _CONTRAST * sigma:  # contamination: keep a row if it is more probably an inlier than an outlier
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))

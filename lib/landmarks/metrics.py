@@ -76,9 +76,9 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> tu
         return np.bincount(which, confidence, bins) / count, np.bincount(which, correct, bins) / count, count
 
 
-def calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> float:
+def calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
     """Expected calibration error: the mean of |confidence - fraction correct| over bins, weighted by their counts."""
-    mean, fraction, count = reliability(confidence, correct, bins)
+    mean, fraction, count = reliability(confidence, correct)
     used = count > 0
     return float(np.average(np.abs(mean - fraction)[used], weights=count[used])) if used.any() else np.nan
 

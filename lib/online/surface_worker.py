@@ -6,9 +6,9 @@ import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from multiprocessing import shared_memory
 
 import numpy as np
+import torch
 
 from lib.cameras import StereoRig
 from lib.online.distance import Surface
@@ -47,12 +47,12 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
 class Beside:
     """Makes surfaces in a separate process.  One job is in work and one waits; a newer job replaces the waiting one.
 
-    If the process dies, it is started again.  Images go through shared memory, results through a pipe.
+    If the process dies, it is started again.  A pipe passes jobs and results; the images are a tensor in shared memory.
     """
 
     def __init__(self) -> None:
         self.dropped, self._waiting, self._in_work, self._stale = 0, None, False, False
-        self._memory: shared_memory.SharedMemory | None = None
+        self._images: torch.Tensor | None = None  # left and right of the job in work, in shared memory
         self._start()
 
     def _start(self) -> None:
@@ -77,14 +77,12 @@ class Beside:
         job = self._waiting
         if self._in_work or job is None:
             return
-        size = job.left.nbytes + job.right.nbytes
-        if self._memory is None or self._memory.size < size:
-            self._free()
-            self._memory = shared_memory.SharedMemory(create=True, size=size)
-        pair = np.ndarray((2, *job.left.shape), np.uint8, self._memory.buf)
-        pair[0], pair[1] = job.left, job.right
+        shape = (2, *job.left.shape)
+        if self._images is None or self._images.shape != shape:
+            self._images = torch.empty(shape, dtype=torch.uint8).share_memory_()
+        np.stack([job.left, job.right], out=self._images.numpy())
         with contextlib.suppress(OSError):  # a dead worker is found by `collect`
-            self._pipe.send((self._memory.name, pair.shape, replace(job, left=None, right=None)))
+            self._pipe.send((self._images, replace(job, left=None, right=None)))
         self._waiting, self._in_work, self._stale = None, True, False
 
     def collect(self) -> tuple[list[Surface], str]:
@@ -109,18 +107,11 @@ class Beside:
         self.dropped += self._waiting is not None
         self._waiting, self._stale = None, True
 
-    def _free(self) -> None:
-        if self._memory is not None:
-            self._memory.close()
-            self._memory.unlink()
-            self._memory = None
-
     def close(self) -> None:
-        """Kill the process, which holds nothing of value, and free the shared memory."""
+        """Kill the process, which holds nothing of value."""
         self._process.kill()
         self._process.join()
         self._pipe.close()
-        self._free()
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
@@ -130,8 +121,6 @@ def _work(pipe: multiprocessing.connection.Connection) -> None:
     pipe.send(None)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
-            name, shape, job = pipe.recv()
-            memory = shared_memory.SharedMemory(name=name)
-            left, right = np.ndarray(shape, np.uint8, memory.buf).copy()
-            memory.close()
+            images, job = pipe.recv()
+            left, right = images.numpy()
             pipe.send(make(replace(job, left=left, right=right)))
