@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import re
 import tomllib
+import warnings
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -370,6 +372,26 @@ def test_numbered_columns_are_a_rotation_where_their_values_are(ends, kind, ship
     assert (pose["rotation"], pose["rotation_kind"]) == (ends, kind)
     path.write_text(text.replace("jaw_mm = [0.0", "jaw_mm = [3.0"), "utf-8")
     np.testing.assert_allclose(logs.read_robot(folder, read_mapping(path))[2], turns.as_matrix(), atol=1e-5)
+
+
+@pytest.mark.parametrize(("in_degrees", "doubted"), [(False, 2), (True, 0)])
+def test_degrees_that_may_be_radians_are_doubted(in_degrees, doubted, shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_poses, lambda *_: HINGE)
+    poses, opening, _ = foreign.posed(few)
+    angles = np.column_stack([Rotation.from_matrix([pose.R for pose in poses]).as_euler("xyz"), opening])
+    table = np.column_stack([few.robot_s, [pose.t for pose in poses], np.rad2deg(angles) if in_degrees else angles])
+    np.savetxt(folder / "pose.tsv", table, "%.6f", "\t", header="s\tpx\tpy\tpz\tA\tB\tC\tjaw_deg", comments="")
+    text = mapping.read_text("utf-8").replace('"qw", "qx", "qy", "qz"', '"A", "B", "C"').replace('"um"', '"mm"')
+    text = text.replace("quaternion_wxyz", "euler_xyz_deg").replace('"stamp_ns"\ntime_unit = "ns"', '"s"')
+    mapping.write_text(text.replace("offset_s = 1700000000", "offset_s = 0"), "utf-8")
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        import_recording(folder, mapping, tmp_path / "eye")
+    said = [str(warning.message) for warning in caught if "Are they radians?" in str(warning.message)]
+    assert len(said) == doubted
+    expected = ("A, B, C", '"rotation_vector_rad"'), ("jaw_deg", 'gripper_unit = "rad"')
+    for text, (names, cure) in zip(said, expected, strict=False):
+        assert re.search(rf"pose\.tsv: the angles in {names} are [\d.]+ degrees at most\. .*{cure}\.$", text)
 
 
 def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
