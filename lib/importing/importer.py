@@ -97,7 +97,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # names the temporary folder of the unfinished recording, which no longer exists
-        raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
+        text = str(error).replace(str(writer.folder / "recording.toml"), str(mapping))
+        raise ValueError(text.replace(str(writer.folder), str(out))) from None
     return report
 
 
@@ -141,6 +142,10 @@ def _landmarks(
     if R is None:
         return x_mm, None
     known = np.isfinite(np.hstack([R, x_mm])).all(axis=(1, 2))
+    if not known.any():
+        names = ", ".join((*spec.robot.pose.position, *spec.robot.pose.rotation))
+        what = f"no row has both a position and a rotation in {names} (a quaternion of zeros is unknown)"
+        raise ValueError(f"robot.pose: {what}. Name other columns of {spec.robot.file}, or log the rotation.")
     poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
     opening = None if opening is None else opening[known]
     tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)

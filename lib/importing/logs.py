@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from lib.recordings.tables import decoded, number, rows_of
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
 _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
+_DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
@@ -114,6 +115,9 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
         values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in named])
     if not time:
         raise ValueError(f"{path}: the table has no row. Export it again.")
+    if table.time_unit == "hms":  # it begins anew at midnight
+        days = accumulate((now < before - _DAY_S // 2 for before, now in pairwise(time)), initial=0)
+        time = [t + _DAY_S * day for t, day in zip(time, days, strict=True)]
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True)), places
 
 

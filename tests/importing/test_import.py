@@ -288,6 +288,27 @@ def test_twelve_grey_bits_in_sixteen_are_not_black(form, shipped, tmp_path):
     assert any("grey" in line for line in report["did"])
 
 
+@pytest.mark.parametrize(("left", "right", "told"), [
+    (4, 16, "Frames of 10 (left) and 12 (right) bits"),
+    (3, 5, "Frames of 12 bits"),  # the left camera saw less light
+])  # fmt: skip
+def test_each_camera_may_have_its_own_depth(left, right, told, shipped, tmp_path):
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for name, factor, side in (("left", left, 0), ("right", right, 1)):
+        for i, pair in enumerate(shipped.frames[:4]):
+            grey = pair[side].mean(axis=-1) * factor
+            grey[0, 0] = 256 * factor - 1
+            cv2.imwrite(str(folder / f"{name}_{i:04d}.png"), grey.astype(np.uint16))
+            (folder / f"._{name}_{i:04d}.png").write_bytes(b"\0\5\x16\7")  # macOS writes such files on foreign disks
+    video = '[video]\nlayout = "two"\nleft = "*left_*.png"\nright = "*right_*.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    did = import_recording(folder, mapping, tmp_path / "eye")["did"]
+    assert any(line.startswith(told) for line in did)
+    frame, pair = Recording.open(tmp_path / "eye").frames[2], shipped.frames[2].mean(axis=(1, 2, 3))
+    means = [frame.left.mean() / pair[0], frame.right.mean() / pair[1]]
+    np.testing.assert_allclose(means[0] / means[1], 1 if left == 4 else left / right, rtol=0.05)
+
+
 def test_other_landmarks_are_imported_and_calibrated(shipped, tmp_path):
     """A probe with two points: the import, its annotations and the calibration know no forceps."""
     two = lambda x: x[:, :2]  # noqa: E731
@@ -410,6 +431,29 @@ def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
     recording = Recording.open(tmp_path / "eye")
     np.testing.assert_allclose(recording.landmarks_mm(), Kinematics(few.robot_s, few.x_mm).at(few.time_s), atol=1e-5)
     assert "Times of the robot count from 34199 s." in did and recording.offset_s == 1
+
+
+def test_times_of_day_go_on_after_midnight(shipped, tmp_path):
+    """The video passes midnight at its sixth frame, and the log with it."""
+    few = replace(thinned(shipped, 5), frames=shipped.frames[:10], time_s=shipped.time_s[:10])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
+    since_s = 86400 - few.time_s[5] + 0.01
+
+    def of_day(t: float) -> str:
+        t = (t + since_s) % 86400
+        return f"{int(t // 3600):02d}:{int(t // 60 % 60):02d}:{t % 60:09.6f}"
+
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    cells = [row.partition(",") for row in rows]
+    (folder / "log.csv").write_text("\n".join([header, *(f"{of_day(float(t))},{rest}" for t, _, rest in cells)]))
+    (folder / "t.csv").write_text("\n".join(["stamp", *map(of_day, few.time_s)]))
+    text = path.read_text("utf-8").replace("[robot]", '[robot]\ntime_unit = "hms"')
+    table = '[video]\ntimes = "table"\ntable = { file = "t.csv", time = "stamp", time_unit = "hms" }\n'
+    path.write_text(text.replace("[video]\n", table), "utf-8")
+    import_recording(folder, path, tmp_path / "eye")
+    recording = Recording.open(tmp_path / "eye")
+    np.testing.assert_allclose(recording.frames.time_s, few.time_s + since_s, atol=1e-5)
+    np.testing.assert_allclose(recording.landmarks_mm(), Kinematics(few.robot_s, few.x_mm).at(few.time_s), atol=1e-4)
 
 
 @pytest.mark.parametrize(("late_s", "told"), [
