@@ -542,6 +542,26 @@ def test_a_clock_beyond_its_search_is_refused_with_the_search_and_the_cure(late_
         import_recording(folder, mapping, tmp_path / "eye")
 
 
+@pytest.mark.parametrize(("late_s", "narrow_s", "refused"), [
+    (60.0, 20, r"^robot\.offset_s, searched from .* Or give a number"),
+    (17.0, 5, r"^robot\.offset_s, searched from -5\.000 to 5\.000 s: .* Or give a number"),
+    (-50_000.0, 49_000, r"do not overlap\..* or widen robot\.search_s to 49957"),
+])  # fmt: skip
+def test_a_wide_search_finds_a_clock_that_is_far_off(late_s, narrow_s, refused, shipped, tmp_path):
+    late = replace(shipped, robot_s=shipped.robot_s + late_s)
+    folder, mapping = source_of(tmp_path, late, foreign.images, foreign.robot_csv, foreign.labels_coco)
+    text = mapping.read_text("utf-8")
+    search = '[robot]\noffset_s = "estimate"\nsearch_s = {}\n'
+    mapping.write_text(text.replace("[robot]\n", search.format(abs(late_s) + 5)), "utf-8")
+    with warnings.catch_warnings(action="error"):  # the offset at which the search starts is of no interest
+        clock = import_recording(folder, mapping, tmp_path / "eye")["clock"]
+    assert abs(clock["offset_s"] - late_s) < 5e-4 and clock["sd_s"] < 5e-4
+    assert np.isfinite(Recording.open(tmp_path / "eye").landmarks_mm()).all()
+    mapping.write_text(text.replace("[robot]\n", search.format(narrow_s)), "utf-8")
+    with pytest.raises(ValueError, match=refused):
+        import_recording(folder, mapping, tmp_path / "two")
+
+
 def test_the_offsets_named_where_log_and_video_do_not_overlap_make_them_overlap(shipped, tmp_path):
     few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     late = replace(few, robot_s=few.robot_s - few.robot_s[0] + 300.0)
