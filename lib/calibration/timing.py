@@ -119,9 +119,10 @@ def estimate_time_offset(
     paths = _paths(kinematics)
     if landmark.max(initial=0) >= len(paths.pieces):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths.pieces)}.")
-    if search_s > _WIDE_S:
-        start_s, search_s = _scanned(paths, (time, landmark, y), start_s - search_s, start_s + search_s), _LEFT_S
     known = np.isfinite(y).any(axis=1) & np.isfinite(time)
+    if search_s > _WIDE_S and paths.span_s and known.any():
+        seen = time[known], landmark[known], y[known]
+        start_s, search_s = _scanned(paths, seen, start_s - search_s, start_s + search_s), _LEFT_S
     known &= np.isfinite(paths.at(landmark, time + start_s, within_s=search_s)).all(axis=1)
     time, frame, landmark, y = time[known], frame[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
@@ -193,12 +194,10 @@ def _scanned(paths: Paths, rows: tuple[np.ndarray, ...], low: float, high: float
     some = np.unique(np.linspace(0, len(rows[0]) - 1, _SCAN_ROWS).astype(int))
     time, landmark, y = (values[some] for values in rows)
     ends = np.array([[piece.t[0], piece.t[-1]] for pieces in paths.pieces for piece in pieces])
-    low, high = max(low, ends.min() - np.nanmax(time)), min(high, ends.max() - np.nanmin(time))  # else there is no overlap
-    trial = np.arange(low, high + _SCAN_S, _SCAN_S)
+    low, high = max(low, ends.min() - time.max()), min(high, ends.max() - time.min())  # beyond that there is no overlap
+    trial = np.arange(low, max(low, high) + _SCAN_S, _SCAN_S)
     parts = np.array_split(trial, len(trial) // 64 + 1)  # to save memory
     misfit = np.concatenate([shift_misfits(paths.at(landmark, time + part[:, None]), y).sum(axis=1) for part in parts])
-    if not np.isfinite(misfit).any():
-        raise DataError(f"search_s: at no offset from {low:.3f} to {high:.3f} s do the kinematics cover most frames.")
     return float(trial[misfit.argmin()])
 
 

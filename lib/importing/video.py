@@ -55,8 +55,8 @@ class _Images:
     def __init__(self, folder: Path, pattern: str) -> None:
         if Path(pattern).is_absolute():
             raise ValueError(f"{pattern}: name the images relative to {folder}, such as left/*.png.")
-        found = [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]
-        if not (found := [path for path in found if not path.name.startswith(".")]):  # such as macOS's ._000000.png
+        files = (path for path in folder.glob(pattern) if path.name[0] != ".")  # macOS writes ._000000.png beside 000000.png
+        if not (found := [path for path in files if path.suffix.lower() in IMAGES]):
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
             raise ValueError(f"{min(bad)}: the name holds no number, so its order is unknown. Number the files.")
@@ -74,9 +74,6 @@ class _Images:
 
     def __len__(self) -> int:
         return len(self.files)
-
-    def place(self, index: int) -> str:
-        return str(self.files[index])
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
         return (read_image(self.files[index], bit_depth=None) for index in wanted)
@@ -129,9 +126,6 @@ class _Film:
             container.streams.video[0].thread_type = "AUTO"
             yield from container.decode(video=0)
 
-    def place(self, index: int) -> str:
-        return f"{self.path}, frame {index}"
-
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
         frames, wanted = self._decoded(), set(map(int, wanted))
         for index in range(max(wanted) + 1):
@@ -161,7 +155,8 @@ class StereoSource:
         usual: list[str] = []  # the sizes of the first frames
         frames = zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True)
         for index, images in zip(self.index, frames, strict=True):
-            places = [reel.place(i) for reel, i in zip(self.reels, index, strict=False)]
+            numbered = zip(self.reels, index, strict=False)
+            places = [reel.files[i] if isinstance(reel, _Images) else f"{reel.path}, frame {i}" for reel, i in numbered]
             images = [to_8_bits(*view) for view in zip(images, self.bit_depths, map(Path, places), strict=True)]
             sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in images]
             usual = usual or sizes

@@ -415,6 +415,43 @@ def test_degrees_that_may_be_radians_are_doubted(in_degrees, doubted, shipped, t
         assert re.search(rf"pose\.tsv: the angles in {names} are [\d.]+ degrees at most\. .*{cure}\.$", text)
 
 
+@pytest.mark.parametrize(("in_degrees", "kind"), [(False, "rotation_vector_rad"), (True, "euler_xyz_deg")])
+def test_rx_ry_rz_are_a_rotation_and_velocities_are_no_points(in_degrees, kind, shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, _ = source_of(tmp_path, few, foreign.side_by_side)
+    turns = Rotation.from_matrix([pose.R for pose in foreign.posed(few)[0]]).as_rotvec(degrees=in_degrees)
+    table = np.column_stack([few.robot_s, few.x_mm[:, 0], turns, few.x_mm[:, 1:].reshape(-1, 6)])
+    header = "t,TCP_x,TCP_y,TCP_z,TCP_rx,TCP_ry,TCP_rz,vx,vy,vz,Force_x,Force_y,Force_z"
+    np.savetxt(folder / "log.csv", table, "%.6f", ",", header=header, comments="")
+    text = guess_mapping(folder)
+    columns = {"position": ["TCP_x", "TCP_y", "TCP_z"], "rotation": ["TCP_rx", "TCP_ry", "TCP_rz"]}
+    assert tomllib.loads(text)["robot"]["pose"] == columns | {"rotation_kind": kind}
+    assert re.search("pose = .* # CHECK: .*are rx, ry, rz a rotation vector, or Euler angles?", text)
+
+
+@pytest.mark.parametrize(("names", "expected"), [
+    (("left_{}", "right_{}"), {"layout": "two", "left": "img/left*.png", "right": "img/right*.png"}),
+    (("{}_L", "{}_R"), {"layout": "two", "left": "img/*L.png", "right": "img/*R.png"}),
+    (("cam_l_{}", "cam_r_{}"), {"layout": "two", "left": "img/*_l_*.png", "right": "img/*_r_*.png"}),
+    (("{}",), {"layout": "side_by_side", "file": "img/*.png"}),
+])  # fmt: skip
+def test_the_guess_of_images_in_one_folder_matches_them_all(names, expected, shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.robot_csv)
+    (folder / "img").mkdir()
+    for name in names:
+        for i in range(6):
+            image = np.full((20, 60 // len(names)), 9 * i, np.uint8)
+            cv2.imwrite(str(folder / "img" / f"{name.format(f'{i:04d}')}.png"), image)
+    text = guess_mapping(folder)
+    video = tomllib.loads(text)["video"]
+    assert {key: video[key] for key in expected} == expected
+    assert ("CHECK: no names of left and right images were found" in text) == (len(names) == 1)
+    path.write_text(text.replace('offset_s = "estimate"', "offset_s = 0"), "utf-8")
+    import_recording(folder, path, tmp_path / "eye")
+    assert len(Recording.open(tmp_path / "eye")) == 6
+
+
 def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
     few = replace(thinned(shipped, 5), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, path = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
