@@ -18,6 +18,8 @@ from lib.geometry import precision
 from lib.recordings import Kinematics
 
 _GRID = 41  # number of trial offsets in the coarse search
+#: Wider searches start with a scan, which needs few rows and leaves a search of the half width `_LEFT_S`.
+_WIDE_S, _LEFT_S, _SCAN_S, _SCAN_ROWS = 1.0, 0.5, 0.02, 400
 _SMOOTH_S = 0.1  # the robot's motion is smooth within this time
 #: A minimum of the misfit is clear if it is this far below the median trial in each camera; then landmarks may have constant
 #: offsets.  The second number is the largest residual with such offsets, as a share of the pixels' extent.
@@ -108,7 +110,7 @@ def estimate_time_offset(
         data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
         kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), sampled densely enough for
             the motion; their noise is averaged over 0.1 s.  NaN = no report; rows in longer gaps are dropped.
-        start_s, search_s: Middle and half width of the search.
+        start_s, search_s: Middle and half width of the search.  A wide one may lead beyond the ends of the kinematics.
 
     A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no
     cameras (`NoConsensusError`), and an offset at the edge of the search.
@@ -118,6 +120,9 @@ def estimate_time_offset(
     if landmark.max(initial=0) >= len(paths.pieces):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths.pieces)}.")
     known = np.isfinite(y).any(axis=1) & np.isfinite(time)
+    if search_s > _WIDE_S and paths.span_s and known.any():
+        seen = time[known], landmark[known], y[known]
+        start_s, search_s = _scanned(paths, seen, start_s - search_s, start_s + search_s), _LEFT_S
     known &= np.isfinite(paths.at(landmark, time + start_s, within_s=search_s)).all(axis=1)
     time, frame, landmark, y = time[known], frame[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
@@ -182,6 +187,18 @@ def estimate_time_offset(
     J = np.concatenate([derivative[:, :, None], used[:, :, None] * camera_columns(x - x.mean(axis=0), m)], axis=2)
     sd = np.sqrt(sandwich(J, W, r, A, frame, landmark)[0][0, 0]) / (1 - noise / information)
     return TimeOffset(offset, float(sd), rms_px, trial, misfit)
+
+
+def _scanned(paths: Paths, rows: tuple[np.ndarray, ...], low: float, high: float) -> float:
+    """The offset from `low` to `high` with the least misfit of rows (time, landmark, pixels)."""
+    some = np.unique(np.linspace(0, len(rows[0]) - 1, _SCAN_ROWS).astype(int))
+    time, landmark, y = (values[some] for values in rows)
+    ends = np.array([[piece.t[0], piece.t[-1]] for pieces in paths.pieces for piece in pieces])
+    low, high = max(low, ends.min() - time.max()), min(high, ends.max() - time.min())  # beyond that there is no overlap
+    trial = np.arange(low, max(low, high) + _SCAN_S, _SCAN_S)
+    parts = np.array_split(trial, len(trial) // 64 + 1)  # to save memory
+    misfit = np.concatenate([shift_misfits(paths.at(landmark, time + part[:, None]), y).sum(axis=1) for part in parts])
+    return float(trial[misfit.argmin()])
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:

@@ -7,6 +7,7 @@ import csv
 import re
 from collections import Counter
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
 import av
@@ -22,6 +23,8 @@ from lib.recordings.tables import decoded, read_toml
 _LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
+_ROTATION = re.compile(r"(?i)(^|[ _.\-])r$")  # of rx, ry, rz
+_NO_POINT = re.compile(r"(?i)(^|[ _.\-])([vwf]|vel\w*|speed|acc\w*|force|torque)$")  # of vx, vy, vz and the like
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
 _NUMBERED = re.compile(r"^(.*?)[ _.\[(]*\d[ _.,\[\]()]*\d?[\])]?$")
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
@@ -32,7 +35,7 @@ def guess_mapping(source: str | Path) -> str:
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
-    paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
+    paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file() and p.name[0] != "."}
     labels = {n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"} or p.stem.startswith("CollectedData")}
     tables, refused = {}, None
     for name in (n for n, p in paths.items() if p.suffix.lower() in (".csv", ".tsv", ".txt") and n not in labels):
@@ -52,6 +55,8 @@ def guess_mapping(source: str | Path) -> str:
     comments = read_toml(Path(__file__).with_name("comments.toml"))
     if "pose" in robot and "rotation" not in robot["pose"]:
         comments["robot.pose"] = comments["robot.rotation"]
+    if "*" in video.get("file", ""):
+        comments["video.file"] = comments["video.images"]
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
     for key, value in guess.items():
         table = key in ("video", "robot", "tool", "labels")
@@ -73,8 +78,8 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
     if not names:
         raise FileNotFoundError(f"{folder}: no video ({', '.join(VIDEOS)}) and no image files in it.")
-    names = names if len(names) > 1 else [names[0].replace("*", f"*{side}*") for side in ("left", "right")]
-    left, right, *_ = sorted(names, key=lambda name: ("right" in name.lower(), name))
+    names = names if len(names) > 1 else _sides(folder, names[0])
+    left, *rights = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
     times = {"times": "container"}
     seconds = [] if films else decimals(list(folder.glob(left)))
@@ -84,7 +89,20 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
         times = {"times": "names", "name_unit": {10: "s", 13: "ms", 16: "us"}.get(digits, "ns")}
     elif not films:
         times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}
-    return {"layout": "two", "left": left, "right": right, **times, "exchanged": False}
+    views = {"layout": "two", "left": left, "right": rights[0]} if rights else {"layout": "side_by_side", "file": left}
+    return {**views, **times, "exchanged": False}
+
+
+def _sides(folder: Path, pattern: str) -> list[str]:
+    """Patterns for the left and the right of a folder's images, if their names tell them apart, else the pattern of all."""
+    every = set(folder.glob(pattern))
+    sides = ("left", "right"), ("Left", "Right"), ("L", "R"), ("l", "r")
+    for pair, form in product(sides, ("*{}", "{}*", "*_{}_*", "*{}*")):
+        names = [pattern.replace("*", form.format(side)) for side in pair]
+        left, right = (set(folder.glob(name)) for name in names)
+        if left and right and left ^ right == every:
+            return names
+    return [pattern]
 
 
 def _frame_times(tables: dict[str, tuple], frames: int) -> dict:
@@ -138,7 +156,12 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
     for column in columns:
         if (match := _AXIS.match(column)) and column not in (*turn.get("rotation", ()), time["time"]):
             groups.setdefault(match[1], {})[match[2].lower()] = column
-    points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
+    groups = {prefix: axes for prefix, axes in groups.items() if set(axes) == set("xyz") and not _NO_POINT.search(prefix)}
+    points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items()}
+    if not turn and len(points) == 2 and (prefix := next(filter(_ROTATION.search, points), None)):
+        angles = np.stack([_numbers(columns[name], dialect["decimal"]) for name in points[prefix]])
+        kind = "rotation_vector_rad" if np.nanmax(np.abs(angles)) <= 2 * np.pi else "euler_xyz_deg"
+        turn = {"rotation": points.pop(prefix), "rotation_kind": kind}
     if not points:
         raise refused or ValueError(f"{paths[name]}: none of {list(columns)} end in x, y and z. Write the mapping by hand.")
     length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")

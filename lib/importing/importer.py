@@ -1,5 +1,6 @@
 """Turns the files of other programs into a recording.  All of them are checked first, and it appears whole or not at all."""
 
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from decimal import Decimal
@@ -55,19 +56,24 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, spec.labels, stereo, spec.landmarks, size) if spec.labels else None
-    frames_s = time_s + offset_s
-    if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
+    least, most = robot_s[0] - time_s[-1], robot_s[-1] - time_s[0]  # the offsets with which log and video overlap
+    search_s = spec.robot.search_s if estimated else 0.0
+    if not least - search_s <= offset_s <= most + search_s:
         spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
         what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
         low, high = sorted(robot_time[end] - stereo.time[end] for end in (0, -1))
         cure = f"a number from {low:.3f} to {high:.3f}, so that they overlap (t_robot = t_video + offset_s)"
         cure += ', or to "estimate" if log and video began together' if one_dated and not estimated else ""
+        cure += f", or widen robot.search_s to {max(least - offset_s, offset_s - most) + 1:.0f}" if estimated else ""
         half_hours = int(float(high) // 1800)  # the largest offset in half hours that makes them overlap
         if (all(zeros) or all(of_day)) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
             hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
             cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
         cure = f"Set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
         raise ValueError(f"{folder / spec.robot.file}: {what}. {cure}.")
+    if estimated:  # the search starts where they overlap; times are rounded to 1e-7 s
+        offset_s = float(np.clip(offset_s, least + 1e-6, most - 1e-6))
+    frames_s = time_s + offset_s
     if labels is not None:  # with a rolling shutter: the mean time at which the rows of a frame's labels were read
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
         mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
@@ -87,7 +93,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             writer.kinematics(robot_s, x_mm)
             if labels is not None:
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
-            draft = writer.draft()
+            with warnings.catch_warnings(action="ignore"):  # the offset may change; what is doubted then is said at the end
+                draft = writer.draft()
             zero_s = float(robot_zero - stereo_zero)
             clock, found = _clock(draft, spec.robot.search_s, zero_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
@@ -97,15 +104,16 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # names the temporary folder of the unfinished recording, which no longer exists
-        raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
+        text = str(error).replace(str(writer.folder / "recording.toml"), str(mapping))
+        raise ValueError(text.replace(str(writer.folder), str(out))) from None
     return report
 
 
 def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset | str:
     """Estimate the clock offset from labels, or from detections if there are none.
 
-    Returns the reason as a string if the detector does not know the tool.  Errors state offsets between the times in the
-    files, which are larger than offsets of the draft by `zero_s`.
+    Returns the reason as a string if the detector does not know the tool, and log and video do overlap.  Errors state
+    offsets between the times in the files, which are larger than offsets of the draft by `zero_s`.
     """
     if (labels := draft.annotations) is not None:
         known = {"u_left": labels.u_left, "u_right": labels.u_right}
@@ -119,7 +127,8 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
     try:
         found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
-        if labels is None and isinstance(error, NoConsensusError | NoDetectionError):
+        wrong = any(doubt.name == "little_overlap" for doubt in draft.doubts)  # so the search had to find the offset
+        if labels is None and isinstance(error, NoConsensusError | NoDetectionError) and not wrong:
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
         what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
@@ -141,6 +150,10 @@ def _landmarks(
     if R is None:
         return x_mm, None
     known = np.isfinite(np.hstack([R, x_mm])).all(axis=(1, 2))
+    if not known.any():
+        names = ", ".join((*spec.robot.pose.position, *spec.robot.pose.rotation))
+        what = f"no row has both a position and a rotation in {names} (a quaternion of zeros is unknown)"
+        raise ValueError(f"robot.pose: {what}. Name other columns of {spec.robot.file}, or log the rotation.")
     poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
     opening = None if opening is None else opening[known]
     tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)

@@ -1,12 +1,13 @@
 """Reads tables of other programs (CSV of any dialect, ROS bags) with exact times, and the robot's log in mm and s."""
 
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from lib.recordings.tables import decoded, number, rows_of
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
 _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
+_DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
@@ -113,6 +115,9 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
         values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in named])
     if not time:
         raise ValueError(f"{path}: the table has no row. Export it again.")
+    if table.time_unit == "hms":  # it begins anew at midnight
+        days = accumulate((now < before - _DAY_S // 2 for before, now in pairwise(time)), initial=0)
+        time = [t + _DAY_S * day for t, day in zip(time, days, strict=True)]
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True)), places
 
 
@@ -208,6 +213,9 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, cm, mm or um.")
     if pose is None:
         return time, x, None, None
+    if pose.rotation_kind == "euler_xyz_deg":
+        cure = 'convert them to degrees; or, if they are a rotation vector, set rotation_kind = "rotation_vector_rad"'
+        _doubt_degrees(path, pose.rotation, np.stack([columns[name] for name in pose.rotation]), 2 * np.pi, cure)
     R = turn @ _rotations(places, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
     return time, x, R, _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
 
@@ -218,10 +226,20 @@ def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:
         if length_mm is None or np.nanmax(np.abs(opening)) > 2 * length_mm:
             raise ValueError(f"{path}: a gripper in mm needs tool.jaw_length_mm, at least half the widest opening.")
         return 2 * np.arcsin(opening / (2 * length_mm))
-    opening = np.deg2rad(opening) if unit == "deg" else opening
+    if unit == "deg":
+        _doubt_degrees(path, [mapping.robot.pose.gripper], opening, 2.0, 'set gripper_unit = "rad"')
+        opening = np.deg2rad(opening)
     if np.nanmax(np.abs(opening)) > np.pi:
         raise ValueError(f"{path}: the gripper opens to {np.nanmax(np.abs(opening)):.3g} rad. Check gripper_unit.")
     return opening
+
+
+def _doubt_degrees(path: Path, names: Sequence[str], angles: np.ndarray, most: float, cure: str) -> None:
+    """Warn that angles which the mapping states in degrees may be radians: they vary, but none exceeds `most`."""
+    largest = np.nanmax(np.abs(angles))
+    if largest <= most and np.ptp(angles[np.isfinite(angles)]) > 0.05:
+        what = f"the angles in {', '.join(names)} are {largest:.3g} degrees at most"
+        warnings.warn(f"{path}: {what}. Are they radians? Then {cure}.", stacklevel=2)
 
 
 def _rotations(places: list[str], pose: Pose, values: np.ndarray) -> np.ndarray:

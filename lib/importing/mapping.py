@@ -90,6 +90,10 @@ class Robot(Table):
     def model_post_init(self, _: object) -> None:
         if (self.landmarks is None) == (self.pose is None):
             raise ValueError("give the columns of the landmarks or those of the pose, and not both")
+        columns = [self.time, *(column for landmark in (self.landmarks or {}).values() for column in landmark)]
+        columns += [*self.pose.position, *self.pose.rotation, self.pose.gripper] if self.pose else []
+        if twice := next((column for column in columns if columns.count(column) > 1), ""):
+            raise ValueError(f"the column {twice!r} is named twice; the time, each axis and each landmark have their own")
 
 
 class Hinge(_Section):

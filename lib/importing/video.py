@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
 
 import av
@@ -55,7 +55,8 @@ class _Images:
     def __init__(self, folder: Path, pattern: str) -> None:
         if Path(pattern).is_absolute():
             raise ValueError(f"{pattern}: name the images relative to {folder}, such as left/*.png.")
-        if not (found := [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]):
+        files = (path for path in folder.glob(pattern) if path.name[0] != ".")  # macOS writes ._000000.png beside 000000.png
+        if not (found := [path for path in files if path.suffix.lower() in IMAGES]):
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
             raise ValueError(f"{min(bad)}: the name holds no number, so its order is unknown. Number the files.")
@@ -146,23 +147,31 @@ class StereoSource:
     video: Video
     index: np.ndarray  # (n, 2) left and right frame of each pair
     time: list[Decimal]
-    bit_depth: int | None  # bits used by 16-bit frames, which are scaled to 8; None for 8-bit frames
+    bit_depths: list[int | None]  # of each reel: bits used by 16-bit frames, which are scaled to 8; None for 8-bit frames
     dropped: int  # number of frames that have no partner
 
     def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Left and right images, (h, w, 3) uint8 RGB."""
-        for images in zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True):
-            images = [to_8_bits(image, self.bit_depth, reel.files[0]) for image, reel in zip(images, self.reels, strict=True)]
+        usual: list[str] = []  # the sizes of the first frames
+        frames = zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True)
+        for index, images in zip(self.index, frames, strict=True):
+            numbered = zip(self.reels, index, strict=False)
+            places = [reel.files[i] if isinstance(reel, _Images) else f"{reel.path}, frame {i}" for reel, i in numbered]
+            images = [to_8_bits(*view) for view in zip(images, self.bit_depths, map(Path, places), strict=True)]
             sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in images]
-            file = self.reels[-1].files[0]
+            usual = usual or sizes
+            for place, size, first in zip(places, sizes, usual, strict=True):
+                if size != first:
+                    raise ValueError(f"{place}: it has {size}, but the frames before it {first}. Export all alike.")
             if self.video.layout != "two":
                 axis = 1 if self.video.layout == "side_by_side" else 0
                 if images[0].shape[axis] % 2:
-                    raise ValueError(f"{file}: images of {sizes[0]} do not split into equal halves. Check layout.")
+                    raise ValueError(f"{places[0]}: images of {sizes[0]} do not split into equal halves. Check layout.")
                 images = np.split(images[0], 2, axis=axis)
             left, right = images[::-1] if self.video.exchanged else images
             if left.shape != right.shape:
-                raise ValueError(f"{file}: left and right frames differ in size ({' and '.join(sizes)}); export both alike.")
+                what = f"left and right frames differ in size ({' and '.join(sizes)})"
+                raise ValueError(f"{places[-1]}: {what}; export both alike.")
             yield left, right
 
 
@@ -180,7 +189,8 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
         raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {times[0][-1] - start} s.")
     dropped, index = sum(map(len, times)) - len(reels) * len(index), np.array(kept)
     time = [times[0][i] for i in index[:, 0]]
-    return StereoSource(reels, video, index, time, video.bit_depth or _bit_depth(reels, index), dropped)
+    depths = [video.bit_depth] * len(reels) if video.bit_depth else _bit_depths(reels, index)
+    return StereoSource(reels, video, index, time, depths, dropped)
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
@@ -201,7 +211,8 @@ def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray
     if video.times == "names" and reel.stamps is None:
         return [exact_seconds(str(n), video.name_unit, str(p)) for n, p in zip(reel.in_names, reel.files, strict=True)]
     if video.times == "table":
-        time = read_columns(folder / video.table.file, video.table, [])[0]
+        time, _, rows = read_columns(folder / video.table.file, video.table, [])
+        increasing(time, str(folder / video.table.file), _STEP_S, "time_unit", rows)
         if len(time) != len(reel):
             raise ValueError(f"{folder / video.table.file}: {len(time)} times for {len(reel)} frames of {reel.files[0]}.")
         return time
@@ -225,15 +236,20 @@ def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
     return index
 
 
-def _bit_depth(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> int | None:
-    """The fewest of 8, 10, 12, 14, 16 bits that hold the brightest value of sampled 16-bit frames; None if all are 8-bit."""
+def _bit_depths(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> list[int | None]:
+    """The fewest of 8, 10, 12, 14, 16 bits that hold the brightest value of sampled 16-bit frames; None for 8-bit frames.
+
+    Cameras that are about equally bright have one depth; else a glint in one view would make the other one brighter.
+    """
     some = index[np.unique(np.linspace(0, len(index) - 1, _DEPTH_SAMPLES).astype(int))]
-    brightest = 0
+    depths, means = [], []
     for reel, wanted in zip(reels, some.T, strict=False):
         if isinstance(reel, _Film):
             wanted = wanted[: max(1, len(wanted) // 4)]  # since a video is decoded from its start
-        for image in reel.read(wanted):
-            if image.dtype == np.uint8:
-                break  # the other camera may have 16
-            brightest = max(brightest, int(image.max()), 1)
-    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits) if brightest else None
+        deep = takewhile(lambda image: image.dtype != np.uint8, reel.read(wanted))  # one camera may have 8, the other 16
+        values = [(int(image.max()), float(image.mean())) for image in deep]
+        brightest, mean = np.max(values or [(0, 0)], axis=0)
+        depths.append(next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits) if values else None)
+        means.append(mean)
+    same = None not in depths and max(means) < 2 * min(means)  # a step of depth is a factor of 4
+    return [max(depths)] * len(depths) if same else depths

@@ -245,6 +245,7 @@ def handedness(
     elif mirrored:
         text = f"The world looks mirrored, since {how}. Then heights and distances have the wrong sign."
         cure = "Flip both images, and undo what was done to the tips' order; or, if the images are right, use a right-handed "
-        cure += "robot frame and exchange left/ and right/. Where the tool does point so, --force goes on."
+        cure += "robot frame and exchange left/ and right/. If the import read poses, check rotation_kind in the mapping "
+        cure += "(the order of a quaternion). Where the tool does point so, --force goes on."
         explained = 1.0 if abs(curved) > SURE_CURVED * curved_sd else share
         yield Hypothesis("mirrored_images", text, cure, 100.0 * share, 0.0, "%", explained, float(gain))

@@ -174,8 +174,11 @@ def test_time_offset_refuses_the_best_of_a_search_that_does_not_fit():
 
 def test_time_offset_refuses_what_it_cannot_see():
     (time, u), (robot_time, robot_x) = video(0, 0)
-    with pytest.raises(ValueError, match="frames lie inside"):
-        estimate_time_offset((time + 100, u), (robot_time, robot_x))
+    for late_s, search_s, x in ((100, 0.2, robot_x), (100, 5.0, robot_x), (0, 5.0, np.full_like(robot_x, np.nan))):
+        with pytest.raises(ValueError, match="frames lie inside"):
+            estimate_time_offset((time + late_s, u), (robot_time, x), search_s=search_s)
+    far = estimate_time_offset((time + 100, u), (robot_time, robot_x), search_s=101)
+    assert far.offset_s == pytest.approx(-100, abs=1e-3)
     with pytest.raises(ValueError, match="increase"):
         estimate_time_offset((time, u), (robot_time[::-1], robot_x))
     with pytest.raises(ValueError, match="frames lie inside"):

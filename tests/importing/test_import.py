@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import re
 import tomllib
+import warnings
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -286,6 +288,27 @@ def test_twelve_grey_bits_in_sixteen_are_not_black(form, shipped, tmp_path):
     assert any("grey" in line for line in report["did"])
 
 
+@pytest.mark.parametrize(("left", "right", "told"), [
+    (4, 16, "Frames of 10 (left) and 12 (right) bits"),
+    (3, 5, "Frames of 12 bits"),  # the left camera saw less light
+])  # fmt: skip
+def test_each_camera_may_have_its_own_depth(left, right, told, shipped, tmp_path):
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for name, factor, side in (("left", left, 0), ("right", right, 1)):
+        for i, pair in enumerate(shipped.frames[:4]):
+            grey = pair[side].mean(axis=-1) * factor
+            grey[0, 0] = 256 * factor - 1
+            cv2.imwrite(str(folder / f"{name}_{i:04d}.png"), grey.astype(np.uint16))
+            (folder / f"._{name}_{i:04d}.png").write_bytes(b"\0\5\x16\7")  # macOS writes such files on foreign disks
+    video = '[video]\nlayout = "two"\nleft = "*left_*.png"\nright = "*right_*.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    did = import_recording(folder, mapping, tmp_path / "eye")["did"]
+    assert any(line.startswith(told) for line in did)
+    frame, pair = Recording.open(tmp_path / "eye").frames[2], shipped.frames[2].mean(axis=(1, 2, 3))
+    means = [frame.left.mean() / pair[0], frame.right.mean() / pair[1]]
+    np.testing.assert_allclose(means[0] / means[1], 1 if left == 4 else left / right, rtol=0.05)
+
+
 def test_other_landmarks_are_imported_and_calibrated(shipped, tmp_path):
     """A probe with two points: the import, its annotations and the calibration know no forceps."""
     two = lambda x: x[:, :2]  # noqa: E731
@@ -372,6 +395,63 @@ def test_numbered_columns_are_a_rotation_where_their_values_are(ends, kind, ship
     np.testing.assert_allclose(logs.read_robot(folder, read_mapping(path))[2], turns.as_matrix(), atol=1e-5)
 
 
+@pytest.mark.parametrize(("in_degrees", "doubted"), [(False, 2), (True, 0)])
+def test_degrees_that_may_be_radians_are_doubted(in_degrees, doubted, shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_poses, lambda *_: HINGE)
+    poses, opening, _ = foreign.posed(few)
+    angles = np.column_stack([Rotation.from_matrix([pose.R for pose in poses]).as_euler("xyz"), opening])
+    table = np.column_stack([few.robot_s, [pose.t for pose in poses], np.rad2deg(angles) if in_degrees else angles])
+    np.savetxt(folder / "pose.tsv", table, "%.6f", "\t", header="s\tpx\tpy\tpz\tA\tB\tC\tjaw_deg", comments="")
+    text = mapping.read_text("utf-8").replace('"qw", "qx", "qy", "qz"', '"A", "B", "C"').replace('"um"', '"mm"')
+    text = text.replace("quaternion_wxyz", "euler_xyz_deg").replace('"stamp_ns"\ntime_unit = "ns"', '"s"')
+    mapping.write_text(text.replace("offset_s = 1700000000", "offset_s = 0"), "utf-8")
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        import_recording(folder, mapping, tmp_path / "eye")
+    said = [str(warning.message) for warning in caught if "Are they radians?" in str(warning.message)]
+    assert len(said) == doubted
+    expected = ("A, B, C", '"rotation_vector_rad"'), ("jaw_deg", 'gripper_unit = "rad"')
+    for text, (names, cure) in zip(said, expected, strict=False):
+        assert re.search(rf"pose\.tsv: the angles in {names} are [\d.]+ degrees at most\. .*{cure}\.$", text)
+
+
+@pytest.mark.parametrize(("in_degrees", "kind"), [(False, "rotation_vector_rad"), (True, "euler_xyz_deg")])
+def test_rx_ry_rz_are_a_rotation_and_velocities_are_no_points(in_degrees, kind, shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, _ = source_of(tmp_path, few, foreign.side_by_side)
+    turns = Rotation.from_matrix([pose.R for pose in foreign.posed(few)[0]]).as_rotvec(degrees=in_degrees)
+    table = np.column_stack([few.robot_s, few.x_mm[:, 0], turns, few.x_mm[:, 1:].reshape(-1, 6)])
+    header = "t,TCP_x,TCP_y,TCP_z,TCP_rx,TCP_ry,TCP_rz,vx,vy,vz,Force_x,Force_y,Force_z"
+    np.savetxt(folder / "log.csv", table, "%.6f", ",", header=header, comments="")
+    text = guess_mapping(folder)
+    columns = {"position": ["TCP_x", "TCP_y", "TCP_z"], "rotation": ["TCP_rx", "TCP_ry", "TCP_rz"]}
+    assert tomllib.loads(text)["robot"]["pose"] == columns | {"rotation_kind": kind}
+    assert re.search("pose = .* # CHECK: .*are rx, ry, rz a rotation vector, or Euler angles?", text)
+
+
+@pytest.mark.parametrize(("names", "expected"), [
+    (("left_{}", "right_{}"), {"layout": "two", "left": "img/left*.png", "right": "img/right*.png"}),
+    (("{}_L", "{}_R"), {"layout": "two", "left": "img/*L.png", "right": "img/*R.png"}),
+    (("cam_l_{}", "cam_r_{}"), {"layout": "two", "left": "img/*_l_*.png", "right": "img/*_r_*.png"}),
+    (("{}",), {"layout": "side_by_side", "file": "img/*.png"}),
+])  # fmt: skip
+def test_the_guess_of_images_in_one_folder_matches_them_all(names, expected, shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.robot_csv)
+    (folder / "img").mkdir()
+    for name in names:
+        for i in range(6):
+            image = np.full((20, 60 // len(names)), 9 * i, np.uint8)
+            cv2.imwrite(str(folder / "img" / f"{name.format(f'{i:04d}')}.png"), image)
+    text = guess_mapping(folder)
+    video = tomllib.loads(text)["video"]
+    assert {key: video[key] for key in expected} == expected
+    assert ("CHECK: no names of left and right images were found" in text) == (len(names) == 1)
+    path.write_text(text.replace('offset_s = "estimate"', "offset_s = 0"), "utf-8")
+    import_recording(folder, path, tmp_path / "eye")
+    assert len(Recording.open(tmp_path / "eye")) == 6
+
+
 def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
     few = replace(thinned(shipped, 5), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
     folder, path = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
@@ -388,6 +468,29 @@ def test_times_of_day_and_a_row_of_units_are_read(shipped, tmp_path):
     recording = Recording.open(tmp_path / "eye")
     np.testing.assert_allclose(recording.landmarks_mm(), Kinematics(few.robot_s, few.x_mm).at(few.time_s), atol=1e-5)
     assert "Times of the robot count from 34199 s." in did and recording.offset_s == 1
+
+
+def test_times_of_day_go_on_after_midnight(shipped, tmp_path):
+    """The video passes midnight at its sixth frame, and the log with it."""
+    few = replace(thinned(shipped, 5), frames=shipped.frames[:10], time_s=shipped.time_s[:10])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
+    since_s = 86400 - few.time_s[5] + 0.01
+
+    def of_day(t: float) -> str:
+        t = (t + since_s) % 86400
+        return f"{int(t // 3600):02d}:{int(t // 60 % 60):02d}:{t % 60:09.6f}"
+
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    cells = [row.partition(",") for row in rows]
+    (folder / "log.csv").write_text("\n".join([header, *(f"{of_day(float(t))},{rest}" for t, _, rest in cells)]))
+    (folder / "t.csv").write_text("\n".join(["stamp", *map(of_day, few.time_s)]))
+    text = path.read_text("utf-8").replace("[robot]", '[robot]\ntime_unit = "hms"')
+    table = '[video]\ntimes = "table"\ntable = { file = "t.csv", time = "stamp", time_unit = "hms" }\n'
+    path.write_text(text.replace("[video]\n", table), "utf-8")
+    import_recording(folder, path, tmp_path / "eye")
+    recording = Recording.open(tmp_path / "eye")
+    np.testing.assert_allclose(recording.frames.time_s, few.time_s + since_s, atol=1e-5)
+    np.testing.assert_allclose(recording.landmarks_mm(), Kinematics(few.robot_s, few.x_mm).at(few.time_s), atol=1e-4)
 
 
 @pytest.mark.parametrize(("late_s", "told"), [
@@ -474,6 +577,26 @@ def test_a_clock_beyond_its_search_is_refused_with_the_search_and_the_cure(late_
     cure = "widen robot.search_s. Or give a number: t_robot = t_video + offset_s."
     with pytest.raises(ValueError, match=f"{text}{cure}$".replace(".", r"\.").replace("+", r"\+")):
         import_recording(folder, mapping, tmp_path / "eye")
+
+
+@pytest.mark.parametrize(("late_s", "narrow_s", "refused"), [
+    (60.0, 20, r"^robot\.offset_s, searched from .* Or give a number"),
+    (17.0, 5, r"^robot\.offset_s, searched from -5\.000 to 5\.000 s: .* Or give a number"),
+    (-50_000.0, 49_000, r"do not overlap\..* or widen robot\.search_s to 49957"),
+])  # fmt: skip
+def test_a_wide_search_finds_a_clock_that_is_far_off(late_s, narrow_s, refused, shipped, tmp_path):
+    late = replace(shipped, robot_s=shipped.robot_s + late_s)
+    folder, mapping = source_of(tmp_path, late, foreign.images, foreign.robot_csv, foreign.labels_coco)
+    text = mapping.read_text("utf-8")
+    search = '[robot]\noffset_s = "estimate"\nsearch_s = {}\n'
+    mapping.write_text(text.replace("[robot]\n", search.format(abs(late_s) + 5)), "utf-8")
+    with warnings.catch_warnings(action="error"):  # the offset at which the search starts is of no interest
+        clock = import_recording(folder, mapping, tmp_path / "eye")["clock"]
+    assert abs(clock["offset_s"] - late_s) < 5e-4 and clock["sd_s"] < 5e-4
+    assert np.isfinite(Recording.open(tmp_path / "eye").landmarks_mm()).all()
+    mapping.write_text(text.replace("[robot]\n", search.format(narrow_s)), "utf-8")
+    with pytest.raises(ValueError, match=refused):
+        import_recording(folder, mapping, tmp_path / "two")
 
 
 def test_the_offsets_named_where_log_and_video_do_not_overlap_make_them_overlap(shipped, tmp_path):

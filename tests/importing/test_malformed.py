@@ -154,6 +154,23 @@ def other_size(folder: Path) -> None:
     cv2.imwrite(str(folder / "right/003.png"), np.zeros((60, 80), np.uint8))
 
 
+def smaller_left(folder: Path) -> None:
+    for path in (folder / "left").iterdir():
+        cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+
+
+def repeated_frame_time(folder: Path, text: str) -> str:
+    (folder / "t.csv").write_text("stamp\n" + "\n".join(f"{0.04 * min(i, 4):.2f}" for i in range(6)))
+    return text.replace("[video]\n", '[video]\ntimes = "table"\ntable = { file = "t.csv", time = "stamp" }\n')
+
+
+def no_rotation(folder: Path, text: str) -> str:
+    path = folder / "pose.tsv"
+    header, *rows = [row.split("\t") for row in path.read_text().splitlines()]
+    path.write_text("\n".join("\t".join(row) for row in [header, *([*row[:4], *"0000", row[8]] for row in rows)]))
+    return pose()(folder, text)
+
+
 def no_bag(folder: Path, text: str) -> str:
     (folder / "x.bag").write_bytes(b"no bag")
     return text.replace("log.csv", "x.bag").replace("time_s", "/tool:received")
@@ -252,7 +269,16 @@ SPOILT = {
         r"CollectedData_x\.csv: not labels of DeepLabCut"),
     "not Label Studio": (labels("label_studio", "x.json", b'[{"data": 3}]'), r"x\.json: not JSON of Label Studio"),
     "not a bag": (no_bag, r"x\.bag: the bag cannot be read"),
-    "images of two sizes": (images(other_size), r"right/000\.png: left and right frames differ in size"),
+    "images of two sizes": (images(other_size),
+        r"right/003\.png: it has 80 x 60 px, but the frames before it 240 x 134 px\. Export"),
+    "cameras of two sizes": (images(smaller_left),
+        r"right/000\.png: left and right frames differ in size \(80 x 60 px and 240 x 134 px\)"),
+    "a repeated time of a frame": (repeated_frame_time,
+        r"t\.csv, line 7: the time repeats \(0\.16 s, then 0\.16 s\)\. Sort"),
+    "no rotation at all": (no_rotation,
+        r"robot\.pose: no row has both a position and a rotation in px, .*, qz \(.*\)\. Name other columns of pose\.tsv"),
+    "a readout longer than a frame": (told('"eye"\n', '"eye"\nreadout_s = 2\n'),
+        r"^[^ ]*map\.toml: readout_s = 2\.0 must lie between 0 and one frame"),
     "a damaged image": (images(lambda f: (f / "left/002.png").write_bytes(b"\x89PNG no")),
         r"left/002\.png: the image is corrupt"),
     "a missing image": (images(lambda f: shutil.rmtree(f / "right")), r"right/\*: no image"),
@@ -260,11 +286,15 @@ SPOILT = {
         r"left/c\.png: the name holds no number"),
     "brighter than told": (ten_bits, r"\d\.png: 16-bit values up to 1900, more than bit_depth = 10"),
     "a script in a name": (told('"eye"', '"<script>alert(1)</script>"'), r"map\.toml: name = .*should match"),
+    "an axis named twice": (told('"tip_1_z"', '"tip_1_y"'), r"map\.toml: robot: the column 'tip_1_y' is named twice"),
+    "a landmark named twice": (told('"tip_2_x", "tip_2_y", "tip_2_z"', '"tip_1_x", "tip_1_y", "tip_1_z"'),
+        r"map\.toml: robot: the column 'tip_1_x' is named twice"),
+    "a rotation named as position": (pose(old='"qw", "qx"', new='"px", "qx"'), r"robot: the column 'px' is named twice"),
     "a misspelt key": (told("[robot]\n", '[robot]\nlenght_unit = "m"\n'),
         r"map\.toml: robot\.lenght_unit = 'm': Extra inputs"),
     "a missing key": (told('length_unit = "mm"\n', ""), r"map\.toml: robot\.length_unit: Field required"),
     "not TOML": (told("[robot]", "[robot"), r"map\.toml: not valid TOML"),
-    "unfit rotations": (pose(old='"qw", "qx", "qy", "qz"', new='"px", "qx", "qy", "qz"'),
+    "unfit rotations": (pose(old='"px", "py", "pz"]\nrotation = ["qw"', new='"qw", "py", "pz"]\nrotation = ["px"'),
         r"pose\.tsv, line 2: columns px, qx, .* are no quaternion_wxyz: -?[\d.]+, .*\. Check rotation_kind"),
     "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0\. Check rot"),
     "an empty landmark": (edit("log.csv", lambda t: re.sub(r"(?m)^(-?\d.*)(,[^,]*){3}$", r"\1,,,", t)),
