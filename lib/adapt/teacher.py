@@ -27,6 +27,7 @@ from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.diagnosis import stated
 from lib.trust.fitting import Problem
+from lib.trust.verdict import with_scene
 
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
 #: the share from which no other threshold is tried.
@@ -456,7 +457,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    best = diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)).best
+    best = with_scene(diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)), recording, seen.frame).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 
 

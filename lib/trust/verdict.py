@@ -340,17 +340,7 @@ def assess(
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
-    if (best := diagnosis.best) is not None and best.name in ("camera_moved", "tool_slipped") and len(best.images) == 2:
-        pairs = (recording.frames[int(i)] for i in (data.frame.min(), data.frame.max()))
-        first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-        moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h is not best]  # NaN decides nothing
-        if best.name == "tool_slipped" and (moved_px > _MOVED_PX).all():
-            diagnosis = Diagnosis(tuple(others))
-        elif best.name == "camera_moved" and (best.value > _NEARER_PX + _TIMES * moved_px).all():
-            text = "Images and robot disagree" + best.text[best.text.index(" at about frame") :]
-            text += " The scene behind the tool stands still, so the robot's report jumped."
-            jumped = replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + ".")
-            diagnosis = Diagnosis((jumped, *others))
+    diagnosis = with_scene(diagnosis, recording, data.frame)
     found = health(recording, data, calibration, detector=detector)
     shaft, best = None, diagnosis.best
     if detector is not None and calibration is not None and (best is None or best.name in ("landmark_offset", *OF_DETECTOR)):
@@ -367,6 +357,29 @@ def assess(
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
+
+
+def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:
+    """The diagnosis of some frames, corrected by the scene behind the tool, which moves only if a camera does."""
+    best = diagnosis.best
+    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift") or len(best.images) < 2:
+        return diagnosis
+    pairs = (recording.frames[int(i)] for i in (frames.min(), frames.max()))
+    first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
+    moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h.name != best.name]  # NaN decides nothing
+    still = (best.value > _NEARER_PX + _TIMES * moved_px).all()
+    if best.name == "tool_slipped":
+        return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
+    if not still:
+        return diagnosis
+    if best.name == "drift":
+        text = f"Images and robot disagree more and more, by {best.value:.1f} px from the first frame to the last."
+        text += " The scene behind the tool stands still: the robot drifts, or the detector's error depends on the pose."
+        cure = f"{_OVERLAYS}. If landmarks are marked beside the tool, {TRAIN_FURTHER}; else look for slack in the robot."
+        return Diagnosis((replace(best, name="robot_drifts", text=text, cure=cure), *others))
+    text = "Images and robot disagree" + best.text[best.text.index(" at about frame") :]
+    text += " The scene behind the tool stands still, so the robot's report jumped."
+    return Diagnosis((replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + "."), *others))
 
 
 def _shaft(recording: Recording, data: Correspondences, calibration: Calibration) -> ShaftEnd | None:

@@ -269,6 +269,17 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     assert "camera_moved" in names and "robot_jumped" not in names
 
 
+def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_do(decoded_once, monkeypatch):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
+    drifting = replace(data, x_mm=data.x_mm + data.frame[:, None] / len(recording) * np.array([0.5, 0.3, 0.2]))
+    (reason,) = (r for r in assess(recording, drifting).verdict.reasons if r.name == "robot_drifts")
+    assert "disagree more and more, by" in reason.text and "cameras" not in reason.text
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
+    names = [r.name for r in assess(recording, drifting).verdict.reasons]
+    assert "drift" in names and "robot_drifts" not in names
+
+
 @pytest.mark.parametrize(("name", "cure"), [("time_stamps", "Keep the first rows."), ("camera_moved", "Do not round.")])
 def test_a_log_that_repeats_its_positions_is_mended_before_the_times(name, cure):
     found = Hypothesis(name, "It errs.", "Do not round.", 23.0, 1.0, "ms", explained=0.9, gain=100.0)
