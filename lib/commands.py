@@ -32,6 +32,7 @@ from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, repor
 _FEWEST, _EXACT_PX = 24, 0.5
 #: Fewer points for each pixel that is not masked show, in the setting "quality", that the images are smooth or noisy.
 _FEW = 1e-3
+_NAMED = 8  # most frames that `detect` names
 
 
 def main_import(argv: list[str]) -> int:
@@ -82,7 +83,10 @@ def main_detect(argv: list[str]) -> int:
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(_assessed(a, recording, data).verdict)
+    found = _assessed(a, recording, data)
+    bad = found.health.frame[found.health.bad.any(axis=1)]
+    named = f": look at frames {', '.join(map(str, bad[:_NAMED]))}{', ...' * (len(bad) > _NAMED)}" if len(bad) else ""
+    print(f"{found.health.text}{named}.\n{found.verdict}")
     return 0
 
 
@@ -92,7 +96,7 @@ def main_calibrate(argv: list[str]) -> int:
     calibration, offsets, verdict, data = _calibrated(a, recording, out)
     if calibration is None:
         return 3
-    print(report(calibration, verdict=verdict).removeprefix(f"{verdict}\n"))
+    print(report(calibration, verdict=verdict, data=data).removeprefix(f"{verdict}\n"))
     _write_landmarks(out / "landmarks.csv", recording, data)
     _write_rig(out, calibration.rig, recording)
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}

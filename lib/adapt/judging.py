@@ -8,6 +8,7 @@ import numpy as np
 
 from lib.adapt.looking import Seen
 from lib.adapt.teacher import RefusalError, Teacher
+from lib.correspondences import FEWEST_TO_TRAIN
 from lib.landmarks.metrics import errors_px, nees, tool_length_px
 from lib.recordings import Recording
 from lib.trust.health import feature_matches
@@ -28,7 +29,7 @@ def stretches(frames: np.ndarray, time_s: np.ndarray, labelled: int = 0) -> dict
     [(0, 24), (26, 31), (33, 39)]
     """
     n = len(frames)
-    if n + labelled < 17 or n < 10:
+    if n + labelled < FEWEST_TO_TRAIN or n < 10:
         raise RefusalError(f"recording: {n + labelled} frames are too few to learn from and to judge by; record 30 or more.")
     first, second = min(round(0.64 * n), n - 7), min(round(0.79 * n), n - 4)  # three are left for judging
     parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}

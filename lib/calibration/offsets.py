@@ -185,10 +185,13 @@ def robots_part(found: LandmarkOffsets, own_sd_mm: np.ndarray) -> tuple[np.ndarr
     """
     widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
     total = widths**2 + own_sd_mm**2 + found.standard_deviation**2
-    width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
+    misfit = (np.log(total) + found.offset**2 / total).sum(axis=(1, 2))
     # A shift of cameras and offsets together changes no label, so its large covariance is no reason for a smaller share.
-    share = width**2 / (width**2 + own_sd_mm**2)
-    variance = share * own_sd_mm**2 + (_ODD * share * found.offset) ** 2
+    shares = widths**2 / (widths**2 + own_sd_mm**2)
+    share, odds = shares[misfit.argmin()], np.exp((misfit.min() - misfit) / 2)
+    # Other widths are possible, too: even if no offset is most probable, its standard deviation is not 0.
+    variance = np.average(shares * own_sd_mm**2 + ((shares - share) * found.offset) ** 2, axis=0, weights=odds)
+    variance += (_ODD * share * found.offset) ** 2
     return share * found.offset, variance[:, :, None] * np.eye(3)
 
 

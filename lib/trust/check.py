@@ -53,7 +53,7 @@ class Check:
         a = self.assessment
         text = TEMPLATES.get_template("check.html").render(
             vars(self), verdict=a.verdict, overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
-            report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
+            report="" if a.calibration is None else report(a.calibration, verdict=a.verdict, data=a.data),
             hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
             shaft=None if a.shaft is None else data_uri(outlined(a.shaft), ".png"),
         )  # fmt: skip

@@ -13,7 +13,7 @@ from lib import paths
 from lib.calibration import Calibration, CompetingCamerasError, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.calibration.checks import extents
 from lib.calibration.offsets import shown_axes, with_offsets
-from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
+from lib.correspondences import FEWEST_TO_TRAIN, LANDMARKS, TRAIN_FURTHER, Correspondences, DataError, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
@@ -349,6 +349,9 @@ def assess(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,
     )  # fmt: skip
+    if len(recording) < FEWEST_TO_TRAIN:  # that cure would be refused
+        longer = f"record {FEWEST_TO_TRAIN} frames or more, then {TRAIN_FURTHER}"
+        verdict = Verdict(tuple(replace(r, cure=r.cure.replace(TRAIN_FURTHER, longer)) for r in verdict.reasons))
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if data.is_by_hand:
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
@@ -393,10 +396,14 @@ def _shaft(recording: Recording, data: Correspondences, calibration: Calibration
     return shaft_end(recording, frames, base, shown_axes(x, calibration.cameras))
 
 
-def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:
+def report(
+    calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010,
+    data: Correspondences | None = None,
+) -> str:  # fmt: skip
     """A calibration as several lines of text, with at most ten outliers, largest residual first.
 
-    Without the verdict of `lib.trust.assess`, only the calibration's own numbers are judged.
+    Without the verdict of `lib.trust.assess`, only the calibration's own numbers are judged.  With the calibrated `data`,
+    outliers have their frame and landmark, else the number of their row.
     """
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
     c, stereo = calibration, {}
@@ -408,5 +415,5 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         stereo = {"optics": optics(c), "depth_um": [1e3 * np.nanmedian(depth) for depth in depths], "degrees": np.rad2deg}
     return TEMPLATES.get_template("report.txt").render(
         stereo, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
-        worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]],
+        worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]], data=data,
     ).rstrip()  # fmt: skip

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lib.calibration import calibrate
+from lib.correspondences import Correspondences
 from lib.trust import report
 from notebooks.studies.simulated_rows import simulate_correspondences
 
@@ -23,6 +24,9 @@ def test_outliers_are_listed():
     u_left[[3, 50]] += 400
     text = report(calibrate(c.x_mm, [u_left, c.u_right]))
     assert "2 outliers (1 %)" in text and "    50:" in text and "left" in text
+    frame, landmark = np.divmod(np.arange(100), 3)
+    data = Correspondences.of_points(c.x_mm, u_left, c.u_right, frame=frame, landmark=landmark)
+    assert "    16 tip_2: " in report(calibrate(data, offsets=False), data=data)
 
 
 def test_the_depth_of_one_detected_point_is_that_of_most():

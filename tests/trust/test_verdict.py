@@ -10,9 +10,9 @@ import pytest
 
 from lib import paths
 from lib.calibration import calibrate
-from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
+from lib.correspondences import TRAIN_FURTHER, Correspondences, DataError, NoDetectionError, of_recording
 from lib.landmarks.shaft import ShaftEnd
-from lib.recordings import Doubt, Recording, Scene
+from lib.recordings import Doubt, Frames, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, judge
 from lib.trust import verdict as verdicts
@@ -255,6 +255,18 @@ def test_data_of_frames_that_the_recording_lacks_are_refused():
     recording = Recording.open(paths.SHIPPED_RECORDING)
     with pytest.raises(ValueError, match=r"data: frame 59 is not among the 34 of .*open_sky_eye"):
         assess(recording, made(60))
+
+
+def test_fewer_frames_than_adapt_takes_are_not_sent_there(decoded_once):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right).of_frames(range(12))
+    data = replace(data, covariance_px2=np.tile(4.0 * np.eye(2), (36, 2, 1, 1)), confidence=np.ones((36, 2)))
+    spoilt = replace(data, u_left=data.u_left + np.random.default_rng(0).normal(0, 60, (36, 2)))
+    sides = [lambda i, side=side: getattr(recording.frames[i], side) for side in ("left", "right")]
+    few = replace(recording, frames=Frames(*sides, recording.frames.time_s[:12]))
+    for own, expected in ((few, True), (recording, False)):
+        cures = [r.cure for r in assess(own, spoilt).verdict.reasons if TRAIN_FURTHER.split("`")[0] in r.cure]
+        assert cures and all(("record 17 frames or more, then let the robot teach it" in cure) == expected for cure in cures)
 
 
 def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(decoded_once, monkeypatch):
