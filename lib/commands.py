@@ -85,7 +85,7 @@ def main_detect(argv: list[str]) -> int:
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
     found = _assessed(a, recording, data)
     bad = found.health.frame[found.health.bad.any(axis=1)]
-    named = f": look at frames {', '.join(map(str, bad[:_NAMED]))}{', ...' * (len(bad) > _NAMED)}" if len(bad) else ""
+    named = f": look at frames {', '.join(map(str, bad[:_NAMED]))}{' and others' * (len(bad) > _NAMED)}" if len(bad) else ""
     print(f"{found.health.text}{named}.\n{found.verdict}")
     return 0
 
