@@ -35,6 +35,8 @@ def run_jobs(
             machine.  Its workers need this environment and the same folders.  If it does not answer: ConnectionError.
         title, unit, progress: Text and unit of the progress bar; False shows no bar.
     """
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers: at least 1 is needed, got {workers}.")
     missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
     known = {"total": len(jobs), "initial": len(jobs) - len(missing), "desc": title, "unit": unit}
     with tqdm(**known, disable=not progress, smoothing=0.1) as bar:

@@ -67,3 +67,8 @@ def test_no_scheduler_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(parallel, "ANSWER_S", 0.2)
     with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"):
         list(parallel.run_jobs(files.write_text, {tmp_path / "a": ("",)}, scheduler="tcp://127.0.0.1:1"))
+
+
+def test_no_workers_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="workers: at least 1"):
+        next(parallel.run_jobs(print, {tmp_path / "a": ()}, workers=-1))

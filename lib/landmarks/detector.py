@@ -304,7 +304,7 @@ class Detector:
         Detections farther away than `NEAR` are missing.  With `reach`, a share of the tool's length, only peaks within it
         count.  With `ground`, as in a call, each landmark is that of the image or of the levelled image, the surer.
         """
-        known = np.isfinite(u).all(axis=2)
+        images, known = as_uint8(images), np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
         u = np.where(known[..., None], u, np.nan)
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))

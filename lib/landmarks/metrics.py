@@ -41,7 +41,7 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
     """Percentage of correct keypoints (paper Sec. V-B): those within `threshold` times the tool's length of the label.
 
     Takes detections and labels (n, 3, 2) px.  A missing detection counts as wrong, a missing label is not counted.
-    `length_px` (n,) are the tool's lengths, None = from the labels; frames of unknown length are not counted.
+    `length_px` (n,) are the tool's lengths, None = from the labels; frames of unknown length, or none, are not counted.
     Returns percent, a float or (t,) as `threshold`; NaN if no label counts.
 
     >>> u_true = np.array([[[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]])
@@ -49,8 +49,7 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
     [33.3, 66.7, 100.0]
     """
     length = tool_length_px(u_true) if length_px is None else np.asarray(length_px, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        relative = errors_px(u, u_true) / length[:, None]
+    relative = errors_px(u, u_true) / np.where(length > 0, length, np.nan)[:, None]
     relative = np.sort(relative[~np.isnan(relative)])
     if not relative.size:
         return np.full(np.shape(threshold), np.nan)[()]

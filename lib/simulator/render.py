@@ -75,7 +75,7 @@ def render_view(
     slope_x = (scene.height(x + eps, y) - scene.height(x - eps, y)) / (2 * eps)
     slope_y = (scene.height(x, y + eps) - scene.height(x, y - eps)) / (2 * eps)
     light_x, light_y = np.multiply(microscope.light_slope, 0.35)
-    lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
+    lambert = (1 + light_x * slope_x + light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
     light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None)
     lighting, at = microscope.lighting, (x, y, z)
     hard = lighting.spot_edge is not None or lighting.shadow_sigma_mm < 0.1  # hard borders need every pixel

@@ -28,7 +28,7 @@ class Microscope:
         depth_of_field_mm: Range of z around `focus_z_mm` with a defocus (sd, at 100 px per mm) of at most 1 px; inf = sharp.
         psf_px: Standard deviation of the point spread in focus.
         exposure_s, readout_s: Exposure of a row, and the time from the first to the last row of a rolling shutter.
-        light_slope: Obliqueness of the light (x, y): shift of a shadow on the retina, in mm per mm of height.
+        light_slope: Direction (x, y) of the lamp, mm sideways per mm of height: a shadow shifts the other way.
         spot_mm, spot_radius_mm: Position where the coaxial light is brightest, and its Gaussian radius.
         brightness, vignetting, gain: Exposure (1 is good), relative loss at the corners, colour gains of each camera.
         full_well, read_noise: Electrons at full scale (infinity switches noise off), and electrons of read noise.

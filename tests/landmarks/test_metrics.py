@@ -11,6 +11,13 @@ def frames(n=4):
     return np.tile([[[0.0, 0.0], [100.0, 0.0], [0.0, 200.0]]], (n, 1, 1))
 
 
+def test_a_tool_without_length_does_not_count():
+    labels = np.array([[[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]], [[5.0, 5.0]] * 3])
+    for off in (0.0, 3.0):
+        assert metrics.pck(labels + [off, 0.0], labels, 0.05) == 100.0
+    assert np.isnan(metrics.pck(labels, labels, 0.05, length_px=[-5.0, 0.0]))
+
+
 def test_pck_is_normalised_by_the_mean_base_to_tip_distance():
     truth = frames(1)
     found = truth + [[[7.4, 0], [7.6, 0], [0, 15.1]]]

@@ -318,3 +318,15 @@ def test_matt_plane_has_no_glints():
     assert not render_pair(Plane(), small)[0].glint_mask.any()
     glossy, other = render_pair(Eye(seed=5, texture_px=256), small)
     assert glossy.glint_mask.any() and (glossy.glint_mask != other.glint_mask).any()
+
+
+def test_ground_that_faces_the_lamp_is_brighter_and_the_shadow_falls_on_the_other_side():
+    microscope = replace(PLAIN, light_slope=(0.9, 0.0))
+    window = Window(microscope.rig(IDENTITY).left, microscope.image_size_px)
+    towards, away = (render_view(Plane(1.0, (slope, 0.0)), microscope, window).image.mean() for slope in (0.4, -0.4))
+    assert towards > 1.05 * away  # z grows with depth, so a positive slope faces +x
+    tool = {"forceps": Forceps(), "pose": Pose((0.0, 0.0, -1.0), azimuth_rad=np.pi / 2, pitch_rad=0.0)}
+    bare, shown = (render_view(Plane(1.0), microscope, window, **own) for own in ({}, tool))
+    darker = np.where(shown.tool_mask, 0.0, (bare.image.astype(float) - shown.image).mean(axis=2).clip(0))
+    shadow_x = (darker * np.arange(darker.shape[1])).sum() / darker.sum()
+    assert shadow_x < shown.u[0, 0]
