@@ -30,6 +30,7 @@ _GRID = re.compile(r";\s*grid:(.*)$")
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
 #: Tag of a cell during which no other notebook of the run may compute: it measures time, or trains for a limited time.
 ALONE = "alone"
+_NO_START = "Kernel died before replying"  # in the error of a kernel that ended before its first cell
 #: Environment variables for the kernels.
 _KERNEL_ENVIRONMENT = {
     "MICROSTEREO_PAGE": "1",  # controls must work in a page, without a kernel
@@ -216,26 +217,31 @@ def execute(
         if cell.cell_type == "code":
             begin(cell)
 
+    def attempt() -> Failure | None:
+        try:
+            papermill.execute_notebook(
+                str(notebook), str(output), parameters, kernel_name="python3", execution_timeout=cell_timeout_s,
+                progress_bar={"desc": label, "leave": False, "disable": not (label and sys.stderr.isatty())},
+                start_timeout=600,  # a kernel may start slowly on a busy machine
+                on_cell_start=on_cell_start,  # this and the next are passed to nbclient
+                extra_arguments=["--IPKernelApp.log_level=50"],  # suppresses a warning of unencrypted TCP on every start
+            )  # fmt: skip
+        except PapermillExecutionError as error:  # `report.stop` does not raise it
+            return Failure("error", running, f"{error.ename}: {strip_color(error.evalue)}")
+        except CellTimeoutError:
+            return Failure("timeout", running, f"the cell took longer than {cell_timeout_s:g} s (--cell-timeout).")
+        except DeadKernelError:
+            return Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
+        except (nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
+            return Failure("error", running or None, f"{type(error).__name__}: {error}")
+        return None
+
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # the returned failure contains its messages
-    try:
-        papermill.execute_notebook(
-            str(notebook), str(output), parameters, kernel_name="python3", execution_timeout=cell_timeout_s,
-            progress_bar={"desc": label, "leave": False, "disable": not (label and sys.stderr.isatty())},
-            start_timeout=600,  # a kernel may start slowly on a busy machine
-            on_cell_start=on_cell_start,  # this and the next are passed to nbclient
-            extra_arguments=["--IPKernelApp.log_level=50"],  # suppresses a warning of unencrypted TCP on every start
-        )  # fmt: skip
-    except PapermillExecutionError as error:  # `report.stop` does not raise it
-        return Failure("error", running, f"{error.ename}: {strip_color(error.evalue)}")
-    except CellTimeoutError:
-        return Failure("timeout", running, f"the cell took longer than {cell_timeout_s:g} s (--cell-timeout).")
-    except DeadKernelError:
-        return Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
-    except (nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
-        return Failure("error", running or None, f"{type(error).__name__}: {error}")
-    return None
+    failure = attempt()
+    # Of kernels that start at once, one may find its ports taken by another.
+    return attempt() if failure and not running and _NO_START in failure.message else failure
 
 
 class Stated(NamedTuple):

@@ -80,6 +80,23 @@ def test_an_error_is_told_with_its_cell(finished):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("deaths", [1, 2])
+def test_a_kernel_that_dies_before_its_first_cell_is_started_once_more(write_notebook, tmp_path, monkeypatch, deaths):
+    """Of kernels that start at once, one may find its ports taken."""
+    import papermill
+
+    calls = []
+
+    def started(*_, **__):
+        calls.append(1)
+        if len(calls) <= deaths:
+            raise RuntimeError("Kernel died before replying to kernel_info")
+
+    monkeypatch.setattr(papermill, "execute_notebook", started)
+    failure = execute(write_notebook(tmp_path, "book", "1"), tmp_path / "executed.ipynb", {})
+    assert len(calls) == 2 and (failure is None) == (deaths == 1)
+
+
 def test_a_timeout_is_detected(write_notebook, tmp_path):
     """papermill calls the cell completed."""
     slow = write_notebook(tmp_path, "00_slow", "import time; time.sleep(300)")
