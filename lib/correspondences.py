@@ -20,8 +20,8 @@ LANDMARK_COLOURS = {"base": (86, 180, 233), "tip_1": (230, 159, 0), "tip_2": (20
 #: Detections of lower confidence count as not seen.
 MIN_CONFIDENCE = 0.2
 #: The cure in messages for a detector that is not trained for the images, and the fewest stereo frames that it takes.
-FEWEST_TO_TRAIN = 17
 TRAIN_FURTHER = "let the robot teach it: `python3 -m lib adapt RECORDING`"
+FEWEST_TO_TRAIN = 17
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short against its motion.
 _VELOCITY_S = 0.05
 #: Shape of a row of each attribute of `Correspondences`, in the order of its arguments.

@@ -349,10 +349,10 @@ def assess(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,
     )  # fmt: skip
-    if len(recording) < FEWEST_TO_TRAIN:  # that cure would be refused
-        longer = f"record {FEWEST_TO_TRAIN} frames or more, then {TRAIN_FURTHER}"
-        verdict = Verdict(tuple(replace(r, cure=r.cure.replace(TRAIN_FURTHER, longer)) for r in verdict.reasons))
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
+    if len(recording) < FEWEST_TO_TRAIN:  # `adapt` would refuse them
+        longer = f"record {FEWEST_TO_TRAIN} frames or more, then {TRAIN_FURTHER}"
+        reasons = [replace(r, cure=r.cure.replace(TRAIN_FURTHER, longer)) for r in reasons]
     if data.is_by_hand:
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."

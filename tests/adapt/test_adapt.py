@@ -20,7 +20,7 @@ from lib.correspondences import DataError
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.shaft import AHEAD, ShaftEnd
-from lib.recordings import Kinematics
+from lib.recordings import Kinematics, Scene
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.adapt.world import SIZE, Kept, StandIn, World, pupil
@@ -423,6 +423,18 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
         assert set(range(12, 19)) <= set(found.report["refused_frames"])
     if fault == "moved":
         assert "moved" in found.report["notes"][0] and tune.calls
+
+
+def test_a_robot_that_drifts_is_no_teacher_and_cameras_that_stand_still_are_not_blamed(world, tmp_path, monkeypatch):
+    def drifting(time_s, x):
+        return x + (time_s / np.ptp(time_s))[:, None, None] * np.array([0.3, 0.32, 0.24])
+
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([0.5, 0.5]))
+    tune = pupil(world)
+    record = world.record(tmp_path / "drifting", robot=drifting)
+    found = adapt(record, StandIn(world.u, wrong=0.3), folder=tmp_path / "out", progress=False, tune=tune)
+    assert not found.improved and not tune.calls
+    assert "Images and robot disagree more and more" in found.report["reason"] and "stands still" in found.report["reason"]
 
 
 def test_a_log_may_hold_its_samples_and_not_stand_still():
