@@ -180,7 +180,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 def robots_part(found: LandmarkOffsets, own_sd_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The robot's part of the offsets (3, 3) mm, and its covariance (3, 3, 3); the rest is the detector's error.
 
-    Both parts have Gaussian priors: the detector's of standard deviations `own_sd_mm` (3, 3), the robot's of the most probable
+    Both parts have Gaussian priors: the detector's of standard deviations `own_sd_mm` (3, 3), the robot's of the likeliest
     one; the covariance allows for others.  Offsets no larger than a detector's usual errors are attributed to the detector.
     """
     widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
