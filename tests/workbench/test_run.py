@@ -259,6 +259,7 @@ def test_exit_codes(without_kernels, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
 def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatch, name, code):
     def killed(*_, **__):
+        time.sleep(0.1)  # so that the main thread waits: it sees a signal just before that only when the wait is over
         os.kill(os.getpid(), getattr(signal, name))
         time.sleep(0.5)  # a kernel takes a moment to end
 
