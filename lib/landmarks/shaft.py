@@ -87,19 +87,28 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
     if min(len(shown) for _, shown in views) < _GROUPS * _FEWEST:
         return AHEAD
 
-    def steps(turns: np.ndarray) -> np.ndarray:
-        """Energy of the steps of the mean profile across the shaft, if these rotation vectors turn `AHEAD` along it."""
-        energy, (wide, high) = np.zeros(len(turns)), _BEHIND_PX
-        for i, direction in enumerate(Rotation.from_rotvec(turns).apply(AHEAD)):
-            for pictures, shown in views:
-                x, y = (along := shown @ direction).T / np.linalg.norm(along, axis=1)
-                upright_from_turned = np.moveaxis(np.array([[x, -y], [y, x]]), 2, 0)
-                corners = upright_from_turned @ [-_GAP_PX - wide, -(high - 1) / 2] + (_AROUND_PX - 1) / 2
-                matrices = np.concatenate([upright_from_turned, corners[:, :, None]], axis=2)
-                flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-                turned = (cv2.warpAffine(*one, (wide, high), flags=flags) for one in zip(pictures, matrices, strict=True))
-                profile = cv2.GaussianBlur((sum(turned) / len(pictures)).mean(axis=1), (1, 3), 0.8)
-                energy[i] += (np.diff(profile, axis=0) ** 2).sum()
+    def profile(picture: np.ndarray, angle: float) -> np.ndarray:
+        """Colours (high, 3) across the shaft: the mean along it of a picture, turned back by `angle` rad."""
+        (long, high), x, y = _BEHIND_PX, np.cos(angle), np.sin(angle)
+        corner = [[x, -y], [y, x]] @ np.array([-_GAP_PX - long, -(high - 1) / 2]) + (_AROUND_PX - 1) / 2
+        matrix = np.column_stack([[-y, x], [x, y], corner])  # along the shaft downwards, since rows are added faster
+        return cv2.warpAffine(picture, matrix, (high, long), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP).mean(axis=0)
+
+    def steps(turns: np.ndarray, rounded: float) -> np.ndarray:
+        """Energy of the steps of the mean profile across the shaft, if these rotation vectors turn `AHEAD` along it.
+
+        Angles in the images are `rounded` to multiples of this, in rad: turns that differ little share their profiles.
+        """
+        directions, energy = Rotation.from_rotvec(turns).apply(AHEAD), np.zeros(len(turns))
+        for pictures, shown in views:
+            x, y = np.einsum("kij,tj->itk", shown, directions)
+            angle = np.rint(np.arctan2(y, x) / rounded)
+            own = np.stack(np.broadcast_arrays(np.arange(len(pictures)), angle), axis=-1).reshape(-1, 2)
+            different, which = np.unique(own, axis=0, return_inverse=True)
+            profiles = np.array([profile(pictures[int(k)], rounded * one) for k, one in different])
+            mean = np.array([profiles[rows].mean(axis=0) for rows in which.reshape(angle.shape)])
+            smooth = cv2.GaussianBlur(np.hstack(mean), (1, 3), 0.8)
+            energy += (np.diff(smooth, axis=0) ** 2).sum(axis=0).reshape(len(turns), -1).sum(axis=1)
         return energy
 
     def grid(half: float, step: float) -> np.ndarray:
@@ -111,7 +120,7 @@ def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes:
     best, usual = np.zeros(3), 0.0
     for half, step in ((_WIDEST_DEG, 8.0), (4.0, 4.0), (2.0, 2.0), (1.0, 1.0)):
         turns = best + grid(half, step)
-        energy = steps(turns)
+        energy = steps(turns, np.radians(step / 4))
         best, usual = turns[energy.argmax()], usual or np.median(energy)  # that of all directions
     return Rotation.from_rotvec(best).apply(AHEAD) if energy.max() > _SHARP * usual else AHEAD
 
