@@ -179,6 +179,8 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     """Open the frames that a mapping describes; images are decoded when they are read."""
     names = [video.left, video.right] if video.layout == "two" else [video.file]
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
+    if len(reels) == 2 and (shared := sorted({*reels[0].files} & {*reels[1].files})):
+        raise ValueError(f"{shared[0]}: video.left and video.right both take it. Name each camera's own files.")
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")

@@ -40,6 +40,7 @@ class Pose:
 
     def __post_init__(self) -> None:
         check(self, "base_mm", lambda v: np.shape(v) == (3,) and np.isfinite(v).all(), "expected three finite coordinates")
+        check(self, "azimuth_rad", math.isfinite, "must be finite")
         check(self, "pitch_rad", lambda v: 0 <= v <= MAX_PITCH_RAD, f"must lie between 0 and {MAX_PITCH_RAD:.2f}")
         rule = f"beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2"
         check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)

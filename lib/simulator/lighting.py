@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from lib.geometry import check
 from lib.simulator.forceps import Nodes
 from lib.simulator.window import Grid, Window
 
@@ -78,6 +79,10 @@ class Lighting:
     scatter_mm: float = 1.0
     haze: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tint_per_mm: tuple[tuple[float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        numbers = "ambient tool shadow shadow_sigma_mm scatter scatter_mm haze"
+        check(self, numbers, lambda v: np.isfinite(v).all(), "must be finite")
 
     def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
         """Light, 0 to 1, at (x, y) mm of a scene, for a spot with this middle and radius."""

@@ -62,6 +62,8 @@ class Microscope:
 
     def __post_init__(self) -> None:
         check(self, "image_size_px", lambda v: min(v) >= 16, "must be at least 16 x 16")
+        finite = "image_rotation_rad focus_z_mm light_slope spot_mm gain"
+        check(self, finite, lambda v: np.isfinite(v).all(), "must be finite")
         check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
         check(self, "psf_px exposure_s readout_s vignetting read_noise brightness", lambda v: v >= 0, "must not be negative")
         check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")

@@ -227,6 +227,17 @@ def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     assert any("1 frames without a partner" in line for line in report["did"])
 
 
+def test_both_cameras_with_the_same_files_are_refused(shipped, tmp_path):
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for i in range(4):
+        cv2.imwrite(str(folder / f"left_{i}.png"), np.full((8, 8), 20 * i, np.uint8))
+    video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "left_?.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    with pytest.raises(ValueError, match=r"left_0\.png: video\.left and video\.right both take it"):
+        import_recording(folder, mapping, tmp_path / "eye")
+    assert not (tmp_path / "eye").exists()
+
+
 @pytest.mark.parametrize(("first", "numbers"), [(3, range(3, 10)), (101, range(7))])
 def test_images_of_a_trigger_counter_pair_by_number_where_one_camera_starts_later(first, numbers, shipped, tmp_path):
     """Where no number is in both cameras, the first images are taken for one instant, and `did` says so."""

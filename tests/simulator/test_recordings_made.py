@@ -10,6 +10,7 @@ from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator import Design, Eye, Forceps, Microscope, Motion, Pose, render_pair, simulate
 from lib.simulator import recording as recording_module
+from lib.simulator.lighting import Lighting
 from lib.simulator.population import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
 from notebooks.studies.realism import STATISTICS, image_statistics, landmark_window
 from notebooks.studies.scenes import Checkerboard, Relief
@@ -159,6 +160,10 @@ def test_training_never_draws_what_test_recordings_show():
         (lambda: Microscope(full_well=0), "full_well"),
         (lambda: Microscope(jpeg_quality=101), "jpeg_quality"),
         (lambda: Microscope(inverse_distance_per_mm=0.2), "working distance"),
+        (lambda: Microscope(focus_z_mm=np.nan), "focus_z_mm"),
+        (lambda: Microscope(gain=((1.0, np.nan, 1.0), (1.0, 1.0, 1.0))), "gain"),
+        (lambda: Lighting(haze=(0.0, np.nan, 0.0)), "haze"),
+        (lambda: Pose(azimuth_rad=np.nan), "azimuth_rad"),
         (lambda: Pose(roll_rad=2.0), "roll_rad"),
         (lambda: Pose(pitch_rad=-0.1), "pitch_rad"),
         (lambda: Pose(base_mm=(0, 0, np.nan)), "base_mm"),
