@@ -242,7 +242,7 @@ def _steps(
 ) -> Calibration:  # fmt: skip
     """The Gauss-Newton steps of `estimate_offsets`; the first `with_all` of them use every detection, outliers too."""
     offset = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3))
-    p_value, views = np.nan, None
+    p_value, score, views = np.nan, None, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
     step, share, before_px, before_inliers = np.zeros(offset.size), 1.0, np.inf, None
@@ -262,8 +262,8 @@ def _steps(
         J = _by_offset(axes, offset, landmark, own)[rows]
         J = J if axes is None else J_x @ J
         information, gradient = _without_cameras(J, J_c, weight, r)
-        if np.isnan(p_value):
-            chosen_sd, p_value = _evidence(information, gradient, 1e-4 if axes is not None else 1e-2)
+        if start is None and score is None:
+            chosen_sd, score = _evidence(information, gradient, 1e-4 if axes is not None else 1e-2)
             prior_sd = prior_sd or chosen_sd
         covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
         before, step = step, covariance @ (gradient - offset.ravel() / prior_sd**2)
@@ -280,6 +280,8 @@ def _steps(
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, J_x, frame[rows], landmark[rows], prior)
     blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])
+    if score is not None:  # correlated errors count less
+        p_value = float(chdtrc(score[0], score[1] * effective / len(r))) if score[0] else 1.0
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
     return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
 
@@ -375,18 +377,17 @@ def _by_offset(axes: Axes, offset: np.ndarray, landmark: np.ndarray, own: np.nda
     return J
 
 
-def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:
-    """The prior's standard deviation (`least` to 3000 times that) of maximum evidence, and the p-value of no offsets.
+def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, tuple[int, float]]:
+    """The prior's standard deviation (`least` to 3000 times that) of maximum evidence, and a score test of no offsets.
 
-    The p-value is that of a score test in the directions whose standard deviation is below 500 times `least`.
+    The test's degrees of freedom and chi-square are of the directions whose standard deviation is below 500 times `least`.
     """
     values, vectors = np.linalg.eigh(information)
     along, candidates = (vectors.T @ gradient) ** 2, least * np.geomspace(1, 3000, 60)
     inflation = 1.0 + candidates[:, None] ** 2 * np.maximum(values, 0.0)
     evidence = (along * candidates[:, None] ** 2 / inflation - np.log(inflation)).sum(axis=1)
     known = values * (500 * least) ** 2 > 1.0
-    p_value = float(chdtrc(known.sum(), (along[known] / values[known]).sum())) if known.any() else 1.0
-    return float(candidates[np.argmax(evidence)]), p_value
+    return float(candidates[np.argmax(evidence)]), (int(known.sum()), float((along[known] / values[known]).sum()))
 
 
 def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float]:

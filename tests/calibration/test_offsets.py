@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import CompetingCamerasError, calibrate, estimate, with_offsets
@@ -308,6 +309,22 @@ def test_without_offsets_none_are_claimed():
         assert (np.abs(found.offset) < 4.5 * found.standard_deviation).all()
     assert min(p_values) > 1e-3 and 0.2 < np.mean(p_values) < 0.8
     assert np.median(priors) < 0.004
+
+
+def test_errors_that_last_on_a_slow_path_are_not_taken_for_offsets():
+    n, p_values = 60, []
+    time = np.arange(n)[:, None] / n
+    turn, base = 0.3 * np.sin(time * [9, 14, 11] + [0, 1, 2]), [3, 2, 1.5] * np.sin(time * [12, 8, 10] + [2, 0, 1])
+    x = np.concatenate([ROBOT_FROM_MICROSCOPE.apply(LANDMARKS_MM @ R.T + b) for R, b in zip(
+        Rotation.from_rotvec(turn).as_matrix(), base, strict=True)])  # fmt: skip
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(size=(n, 3, 4))
+        noise[1:] *= 0.6
+        noise = lfilter([1.0], [1.0, -0.8], noise, axis=0).reshape(-1, 4)  # 0.8 from frame to frame
+        u = np.hstack(reference_rig().project(x)) + noise
+        of_rows = {"frame": np.repeat(np.arange(n), 3), "landmark": np.tile(np.arange(3), n)}
+        p_values.append(calibrate(Correspondences.of_points(x, u[:, :2], u[:, 2:], **of_rows)).offsets.p_value)
+    assert min(p_values) > 1e-3
 
 
 def test_a_tool_that_never_turns_tells_only_the_difference_between_landmarks():
