@@ -377,6 +377,11 @@ def test_wrong_labels_come_before_the_noise_that_they_make(small):
     assert answers["Then what?"] == "Look again." and bad == 6
     answers, bad, note = verdicts.in_words(Recording.open(small), found, "Check.")
     assert answers["Then what?"] == "Noise. Check." and bad == 0 and "another cause" in note
+    amber = trust.Reason("base", trust.LEVELS[1], "The base is off.", "Look.")
+    found = SimpleNamespace(verdict=trust.Verdict((amber,)), diagnosis=trust.Diagnosis(), health=health, calibration=None)
+    answers, _, _ = verdicts.in_words(Recording.open(small), found, "Check.")
+    assert answers["Is the detector usable?"] == "In doubt. The base is off. 6 of 6 frames are bad."
+    assert answers["Then what?"].startswith("Adapt")
 
 
 def test_notebook_7_says_what_it_needs_of_landmarks_and_weights(small, tmp_path, monkeypatch):

@@ -66,18 +66,18 @@ def main(argv: list[str] | None = None) -> int:
     add("--record", type=Path, metavar="FOLDER", help="write inputs and outputs; FOLDER/input is a recording")
     add("--video", type=Path, metavar="FILE.mp4", help="write a video of images, states and distances")
     add("--weights", type=Path, help="detector (default: the one that ships)")
-    add("--frames", type=int, help="only the first N frames")
+    add("--frames", metavar="A:B", help="use frames A to B - 1 (default: all); --frames=-10: uses the last ten")
     add("--surface-every", type=int, default=1, help="reconstruct the surface in every N-th frame")
     a = parser.parse_args(argv)
-    if min(a.surface_every, 1 if a.frames is None else a.frames) < 1:
-        parser.error("--frames and --surface-every: must be at least 1.")
+    if a.surface_every < 1:
+        parser.error("--surface-every: must be at least 1.")
     recording = Recording.open(a.recording)
     if recording.skeleton != LANDMARKS:
         names = ", ".join(recording.skeleton)
         raise ValueError(f"{a.recording}: its landmarks are {names}; the online system follows {', '.join(LANDMARKS)}.")
     settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
     detector = Detector.load(a.weights)
-    frames = recorded(recording, a.frames)
+    frames = recorded(recording, None if a.frames is None else recording.frames_of(a.frames))
     recorder = None
     feed = Live(frames) if a.live else frames
     with contextlib.ExitStack() as stack:

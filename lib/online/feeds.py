@@ -8,7 +8,7 @@ import queue
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,8 +38,8 @@ class Arrival:
     source: int = -1  # -1: of no recording
 
 
-def recorded(recording: Recording, n_frames: int | None = None) -> Iterator[Arrival]:
-    """The frames of a recording, each when it is asked for.
+def recorded(recording: Recording, frames: Iterable[int] | None = None) -> Iterator[Arrival]:
+    """The frames of a recording (None = all), each when it is asked for.
 
     Any other iterator of `Arrival` can take its place.  A live camera, for example:
 
@@ -48,7 +48,7 @@ def recorded(recording: Recording, n_frames: int | None = None) -> Iterator[Arri
             left, right = (cv2.cvtColor(camera.read()[1], cv2.COLOR_BGR2RGB) for camera in cameras)
             yield Arrival(left, right, robot.landmarks_mm(), time.monotonic())
     """
-    for index in range(len(recording))[:n_frames]:
+    for index in range(len(recording)) if frames is None else frames:
         frame = recording.frames[index]
         yield Arrival(frame.left, frame.right, partial(of_recording, recording, frames=[index]), frame.time_s, source=index)
 

@@ -30,6 +30,11 @@ STATES = {
 }
 
 
+def told(error: Exception) -> str:
+    """What a failure says: a ValueError in its own words, another error with its type."""
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+
+
 @dataclass(frozen=True)
 class Settings:
     """The settings of the online system.
@@ -139,6 +144,6 @@ class FrameResult:
         try:
             yield
         except Exception as error:  # any error at all: the next frame comes in 40 ms
-            self.failures[name] = f"{type(error).__name__}: {error}"
+            self.failures[name] = told(error)
         finally:
             self.seconds[name] += time.perf_counter() - start

@@ -12,6 +12,7 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.online.distance import Surface
+from lib.online.result import told
 from lib.surface import Reconstruction, reconstruct
 
 _STAGE_OF = {"mask": "match", "refine": "match"}  # part of a reconstruction -> stage, where the names differ
@@ -37,7 +38,7 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
         found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
     except Exception as error:  # any error at all: the next frame may have a surface
         part = next(reversed(seconds), "match")
-        found, failures = None, {_STAGE_OF.get(part, part): f"{type(error).__name__}: {error}"}
+        found, failures = None, {_STAGE_OF.get(part, part): told(error)}
     spent = Counter()
     for part, duration in seconds.items():
         spent[_STAGE_OF.get(part, part)] += duration

@@ -14,6 +14,7 @@ from lib.recordings import StereoFrame
 from lib.trust.check import overlay
 
 _SIZE = (1280, 720)
+_STEPS_MM = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # between the lines of the curve
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
                    strict=True))  # fmt: skip
 
@@ -49,7 +50,8 @@ class Dashboard:
             row = np.clip(10 + height * (1 - (mm + 0.1) / (top + 0.1)), 0, height + 20)
             return int(60 + i * width / self._past.maxlen), int(row)
 
-        for mm in np.linspace(0, top, 5):
+        step = next((step for step in _STEPS_MM if top <= 5 * step), top)
+        for mm in np.arange(0, top, step):
             cv2.line(part, place(0, mm), place(self._past.maxlen, mm), (225, 225, 225), 1)
             _text(part, f"{mm:.1f}", (15, place(0, mm)[1] + 4))
         for k, name in enumerate(LANDMARKS):
@@ -59,7 +61,7 @@ class Dashboard:
                     cv2.line(part, place(i, d - 2 * sd), place(i, d + 2 * sd), pale, 2)
                     cv2.circle(part, place(i, d), 2, LANDMARK_COLOURS[name], -1, cv2.LINE_AA)
             _text(part, name, (60 + 90 * k, part.shape[0] - 8), tuple(0.6 * c for c in LANDMARK_COLOURS[name]))
-        _text(part, "mm to the retina, with 2 sd", (360, part.shape[0] - 8))
+        _text(part, f"mm to the retina, with 2 sd; the last {len(past)} frames", (360, part.shape[0] - 8))
 
     def _times(self, part: np.ndarray, result: FrameResult) -> None:
         for i, stage in enumerate(STAGES):

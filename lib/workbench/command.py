@@ -86,6 +86,8 @@ def run(
     be written; its state is then "failed", if that can still be written.
     """
     chosen = execution.choose_notebooks(names, notebooks)
+    if any(name == "profile" for name, _ in pairs):
+        raise ValueError("parameter profile: give it as --profile.")
     values = execution.parse_parameters(pairs, chosen, profile)
     jobs = min(cores(), _AT_ONCE) if jobs is None else jobs
     if jobs < 1:

@@ -127,7 +127,8 @@ def _value(name: str, text: str, kind: str) -> object:
         return list(value) if isinstance(value, tuple | set) else value  # papermill passes these as text
     except (ValueError, KeyError, SyntaxError):
         if kind in (*simple, "list", "tuple", "dict", "set"):
-            raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
+            example = {"list": ", such as [1, 2]", "tuple": ", such as (1, 2)"}.get(kind, "")
+            raise ValueError(f"parameter {name}: {text!r} is not of type {kind}{example}.") from None
         return {"true": True, "false": False, "none": None}.get(text.lower(), text)
 
 

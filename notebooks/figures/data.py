@@ -112,7 +112,8 @@ def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure
         spectrum = np.abs(np.fft.rfft(np.diff(dense, axis=0) * np.hanning(len(dense) - 1)[:, None], axis=0)).sum(axis=1)
         row[2].plot(np.fft.rfftfreq(len(dense) - 1, step), spectrum, color=COLOURS["ours"])
         row[2].axvspan(8, 12, color="#fdebd0", zorder=0)
-        row[2].set(xlim=(0, 20), yscale="log", xlabel="frequency (Hz)", ylabel="amplitude")
+        row[2].set(xlim=(0, 20), yscale="log", xlabel="frequency (Hz)", ylabel="amplitude, arbitrary unit")
+        row[2].set_xticks(range(0, 20, 4))
         row[2].set_title("Velocity spectrum (tremor: 8 to 12 Hz)")
     return page
 

@@ -109,7 +109,7 @@ def in_words(
         moved = "Not known until the cause below is removed: it makes the cameras uncertain."
     if assessed.calibration is None:
         moved = "Not known: the cameras could not be calibrated."
-    unfit = [reasons[name] for name in OF_DETECTOR + (() if named else _LOST) if name in reasons]
+    unfit = [reasons[name] for name in (*OF_DETECTOR, "base", *(() if named else _LOST)) if name in reasons]
     first = reasons[cause.name] if named else next(iter(reasons.values()), None)
     if unfit and not named and not next_step:  # doubts about the labels come before doubts that may follow from them
         first = unfit[0]
@@ -121,7 +121,10 @@ def in_words(
         then = next_step  # while the times are wrong, nothing else is known
     elif next_step and unfit and not named:
         then = f"Adapt; then label {min(max(bad, _FEWEST), _MOST)} stereo frames."
-    usable = f"{_refusal(unfit)} {bad} of {frames} frames are bad." if unfit else "Yes."
+    usable = "Yes."
+    if unfit:
+        why = "" if named else f"{unfit[0].text} "
+        usable = f"{_refusal(unfit)} {why}{bad} of {frames} frames are bad."
     answers = {
         "Enough motion?": _answer(reasons, _MOTION if named else _MOTION + _UNSURE, moved),
         "Do the clocks agree?": _answer(reasons, _TIMES, "Nothing speaks against it."),

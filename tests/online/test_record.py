@@ -39,7 +39,7 @@ class Looked:
 def write(recording, truth, folder, n=10):
     recorder = Recorder(folder, recording)
     pipeline = OnlinePipeline(Looked(truth), settings=Settings(surface_every=9, calibration_frames=(6, 60)))
-    for arrival in recorded(recording, n):
+    for arrival in recorded(recording, range(n)):
         result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
         recorder.add(arrival, result)
     recorder.close()
@@ -100,13 +100,15 @@ def test_the_video_shows_every_state(tmp_path):
 
 def test_the_command(tmp_path, shipped, monkeypatch, capsys):
     monkeypatch.setattr(command.Detector, "load", lambda _: Looked(shipped.truth))
-    assert command.main([str(shipped.folder), "--frames", "9", "--surface-every", "8", "--record", str(tmp_path / "run"),
+    assert command.main([str(shipped.folder), "--frames", "0:9", "--surface-every", "8", "--record", str(tmp_path / "run"),
                          "--video", str(tmp_path / "run.mp4")]) == 0  # fmt: skip
     out = capsys.readouterr().out
     assert "9 frames in" in out
     assert "tracking" in out
     assert (tmp_path / "run" / "frames.csv").is_file()
     assert (tmp_path / "run.mp4").stat().st_size > 1000
+    with pytest.raises(ValueError, match="--frames 9: two numbers and a colon are needed"):
+        command.main([str(shipped.folder), "--frames", "9"])
     with pytest.raises(SystemExit):
-        command.main([str(shipped.folder), "--frames", "0"])
+        command.main([str(shipped.folder), "--surface-every", "0"])
     assert "at least 1" in capsys.readouterr().err

@@ -246,6 +246,7 @@ def test_exit_codes(without_kernels, tmp_path, monkeypatch, capsys):
     assert main(["00", "--runs", str(tmp_path / "bad")]) == 1
     assert "FAILED 00_error: error in cell 3: ZeroDivisionError: division by zero" in capsys.readouterr().err
     for words, text in [(["03", "-p", "sede", "1"], "unknown parameter: sede"), (["07"], "unknown notebook: 07"),
+                        (["03", "-p", "profile", "paper"], "give it as --profile"),
                         (["03", "--runs", __file__], "test_run.py")]:  # fmt: skip
         assert main(["--runs", str(tmp_path / "none"), *words]) == 2
         said = capsys.readouterr().err
