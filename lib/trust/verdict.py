@@ -68,7 +68,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
 #: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
-_NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
+_NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 _BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
