@@ -109,10 +109,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     chosen = matches.keep((np.abs(apart).max(axis=2, initial=0) <= 1.5).sum(axis=0) > 3)  # each match counts itself
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
-    displacement = (chosen.cell + step) * CELL_PX / scale
-    # The reference depths of the two canvases differ because each is rounded to whole pixels of its own canvas.
-    displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
-    return displacement
+    return (chosen.cell + step) * CELL_PX / scale
 
 
 def _descriptors(
