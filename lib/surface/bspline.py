@@ -23,6 +23,7 @@ REJECT_MEDIANS = 5.0
 _FOLDS = 3
 _ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # held-out points that suffice to choose the smoothness
 _LADDER = 10.0**0.5  # ratio of neighbouring candidates of the smoothness
+_LARGEST = 1e18  # smoothness above which rounding hides the data; far below, the surface is already a plane
 _EXTENT = 8  # largest number of steps from the first candidate, up or down
 
 
@@ -258,8 +259,8 @@ def fit_surface(
     if spread[1] < 1e-6 * spread[0]:
         raise ValueError("u: the points lie on one line of the image, which does not determine a surface.")
     axes, values, norms = _outputs(x, covariance_mm2, camera)
-    if smoothness is not None and not (np.isfinite(smoothness) and smoothness >= 0):
-        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
+    if smoothness is not None and not 0 <= smoothness <= _LARGEST:
+        raise ValueError(f"smoothness: mu must be from 0 to {_LARGEST:g} px^2/mm, or None to choose it; got {smoothness}.")
     if reject_mm is not None and not reject_mm > 0:
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
     exact = search = solver
@@ -339,7 +340,7 @@ def _choose_smoothness(
     parts = [(L1Problem(grid, u[~test]), ~test, grid.design(u[test]), test) for test in tests]
     # A typical value as the first candidate; the result hardly depends on it.
     spread = np.median(np.abs(values - np.median(values, axis=0)))
-    unit = 0.001 / _LADDER * n * float(np.prod(grid.cell_px)) / max(spread, 1e-9)
+    unit = 0.001 / _LADDER * n * float(np.prod(grid.cell_px)) / max(spread, 1e-6)
     errors: dict[int, float] = {}
 
     def error(step: int) -> float:

@@ -158,6 +158,16 @@ def test_planes_and_exact_data_are_fine(slope):
     np.testing.assert_allclose(surface(u), x, atol=1e-6)
 
 
+@pytest.mark.parametrize("smoothness", [None, 1.0, 1e18])
+def test_a_plane_that_faces_the_camera_is_fitted_exactly(bowl, smoothness):
+    """It has one depth, so nothing in the data tells how stiff the surface may be."""
+    camera, u = bowl.rig.left, bowl.u_left
+    plane = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T + 3 * camera.viewing_direction
+    found = fit_surface(u, plane, domain=bowl.domain, control=(8, 8), camera=camera, smoothness=smoothness)
+    inside = found.grid.inside(u)
+    np.testing.assert_allclose(found(u[inside]), plane[inside], atol=1e-6)
+
+
 def test_points_without_scatter_have_no_covariance():
     u = np.random.default_rng(0).uniform(0, 100, (200, 2))
     surface = fit_surface(u, np.column_stack([u / 100, 0 * u[:, 0]]), domain=(0, 0, 100, 100), control=(8, 8))
