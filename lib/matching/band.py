@@ -92,10 +92,7 @@ def plan_search(
 
 
 def coarse_reach_px(rectification: Rectification, shape_right: tuple[int, int]) -> float:
-    """Half width of the coarse search, in canvas pixels.
-
-    It is a share of the canvas, and more if one image is wider than the other, which may show any part of it.
-    """
+    """Half width of the coarse search in canvas px: more if one image is wider, since the other may show any part of it."""
     width, (low, high) = rectification.size_px[0], rectification.shared_range_px(shape_right)
     return COARSE_REACH * width + abs(high - low - 2 * width) / 2
 

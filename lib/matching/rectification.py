@@ -75,8 +75,8 @@ def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int,
     size = tuple(int(n) for n in np.ceil((corners.max(axis=0) - origin) * scale - 1e-6))
     # canvas = scale (Q u - origin) - 1/2, so that with Q = 1 and scale 1 the canvas is the left image.
     left = np.column_stack([Q.T / scale, Q.T @ (0.5 / scale + origin)])
-    right_linear = H @ left[:, :2]
     at_zero = H @ (left[:, 2] - rig.left.offset_px) + rig.right.offset_px
+    right_linear = H @ left[:, :2]
 
     # At the reference depth the middle pixels lie together, up to the shift off the line.  So the canvas does not depend on
     # the origin of the rig's frame, and a rectified pair is moved by whole pixels, thus not resampled.

@@ -52,14 +52,13 @@ class SurfaceFit:
         would then promise too much.  So mu is reduced until the bending energy is what the prior expects: 4 f mu c.R.c equals
         the number of coefficients that the data determine, without the three of a plane (MacKay, Neural Comput. 4, 1992).
         """
-        posterior = []
-        sizes = np.abs(self.weights * self.residual)
+        posterior, sizes = [], np.abs(self.weights * self.residual)
         for mu, energy, weights, size in zip(self.penalty, self.bending_energy, self.weights.T, sizes.T, strict=True):
             # The surface interpolates some points exactly.  Half of the others are within their median: f = 0.5 / (2 median).
             free = size[size > 1e-3 * size.mean()]
             if not len(free):
                 what = "the surface passes through all its points, so their scatter is not known"
-                raise ValueError(f"covariance: {what}; fit fewer control points or, if the points have no noise, do without.")
+                raise ValueError(f"covariance: {what}; fit fewer control points.")
             density = 0.25 / max(np.median(free), np.finfo(float).tiny)
             factor = self._factor(mu, density, weights)
             loose = 2 * mu * np.trace(cho_solve_banded((factor, True), self.problem.bending.toarray()))
@@ -159,9 +158,8 @@ class BSplineSurface:
         C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
         Errors of neighbouring matches are correlated, so C is inflated by the correlation of the signs of their residuals;
         the outputs are correlated as these signs are.  Common errors of all points, such as the calibration's, are left out.
-        Where no point is near, as below a mask, the prior alone limits the surface: mu is then at most what the surface's own
-        bending suits (`SurfaceFit.posterior`).  A step is still not expected there, nor all of an undulation as wide as the
-        mask (in simulations 67 % of such errors were within 1.96 standard deviations).
+        Where no point is near, as below a mask, only the prior limits the surface: it does not expect a step there, nor all
+        of an undulation as wide as the mask (in simulations 67 % of such errors were within 1.96 standard deviations).
         """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")

@@ -53,9 +53,7 @@ def surface_mesh(
     Args:
         step_px: Largest distance of neighbouring vertices in the left image.
         image: (h, w, 3) uint8 RGB left image for the texture.
-        mask: (h, w) bool, of the left image, True where the surface is shown; None is everywhere.
-
-    A ValueError refuses a mask that hides all, or that is not of the image's size.
+        mask: (h, w) bool of the left image, True where the surface is shown; None is everywhere.  Not all may be hidden.
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
