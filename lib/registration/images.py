@@ -5,6 +5,7 @@ every pixel is weighted by its own noise, and landmarks that only one camera see
 cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
 """
 
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,6 +24,7 @@ from lib.registration.rigid import Registration, check_spread, motion_jacobian, 
 _FREEDOM = 4.0  # degrees of freedom of Student's t for "robust": gross errors lose their weight, small ones keep it
 _STATED_ROWS = 20  # number of rows that the stated noise counts for, against the residuals' scatter, in the covariance
 _OUTLIER = 16.0  # chi-square of the two coordinates in an image above which it is an outlier (1 in 3,000 by chance)
+_UNSURE_RAD = np.deg2rad(5.0)  # standard deviation of a rotation above which `register_images` warns
 _UNDETERMINED = 1e-12  # relative curvature below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
@@ -44,7 +46,9 @@ def register_images(
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
         loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
 
-    A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.
+    A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.  A warning says that
+    a rotation is uncertain by more than 5 degrees (standard deviation), as in a single frame with shut jaws: then it may be
+    wrong by far more than its covariance states.
 
     >>> from lib.cameras import AffineCamera
     >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
@@ -52,7 +56,12 @@ def register_images(
     >>> register_images(rig, x + [0.2, 0.1, 0.5], *rig.project(x)).transform.t.round(6).tolist()
     [0.2, 0.1, 0.5]
     """
-    return _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
+    found = _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
+    sd_rad = np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])
+    if sd_rad > _UNSURE_RAD:
+        what = f"the rotation about an axis has a standard deviation of {np.rad2deg(sd_rad):.0f} degrees, so it may be wrong"
+        warnings.warn(f"x_mm: {what}; use more frames, or frames with open jaws.", stacklevel=2)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -214,6 +215,20 @@ def test_covariance_at_grows_with_distance():
     np.testing.assert_allclose(near, fit.covariance[3:, 3:], rtol=1e-9)
     assert np.trace(far) > 2 * np.trace(near)
     np.testing.assert_allclose(fit.translation_sd_mm, np.sqrt(np.diag(near)))
+
+
+@pytest.mark.parametrize("loss", ["squared", "robust"])
+def test_one_frame_with_shut_jaws_does_not_show_the_rotation(loss):
+    """It may be wrong by tens of degrees, since the three landmarks lie nearly on a line: a warning says so."""
+    noise = {"covariance_px2": SIGMA_PX**2, "sigma_x_mm": SIGMA_MM, "loss": loss}
+    shut, opened = (
+        tool_frames(1, rng=np.random.default_rng(3), rig=RIG, opening_rad=(rad, rad), sigma_u_px=SIGMA_PX)
+        for rad in (0.005, 0.5)
+    )
+    with pytest.warns(UserWarning, match="x_mm: the rotation about an axis .* use more frames, or frames with open jaws"):
+        register_images(RIG, shut, **noise)
+    with warnings.catch_warnings(action="error"):
+        register_images(RIG, opened, **noise)
 
 
 def test_one_image_of_a_landmark_still_counts():
