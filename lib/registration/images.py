@@ -239,13 +239,15 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     if np.linalg.matrix_rank(information, tol=_UNDETERMINED * np.trace(information), hermitian=True) < parameters:
         cure = "Add frames in other positions." if data.seen.any(axis=0).all() else "Both cameras must see the tool."
         raise ValueError(f"x_mm, u_left, u_right: these landmarks do not determine the motion. {cure}")
-    covariance = np.linalg.pinv(information, rcond=_UNDETERMINED, hermitian=True)
+    # A row tells at most what its noise allows, but the robust weights of small residuals exceed 1.
+    rows, gradient = gradients(found.state, found.work)
+    stated = (rows / np.maximum(weights, 1.0)[:, None, None]).sum(axis=0)
+    covariance = np.linalg.pinv(stated, rcond=_UNDETERMINED, hermitian=True)
     n, size = used.sum(), data.dimension.sum()
     own = covariance * distance2.sum() / max(size - parameters, 1)
     if loss == "robust":
         # The weights fall as a residual grows, so the Hessian is smaller than the weighted information.  If nothing fits,
         # the Hessian may be indefinite; then use the information.
-        _, gradient = gradients(found.state, found.work)
         hessian = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         indefinite = np.linalg.eigvalsh(hessian)[-parameters] <= _UNDETERMINED * np.trace(information)
         own = sandwich(information if indefinite else hessian, gradient[used], parameters * n / size)

@@ -208,6 +208,16 @@ def test_covariances_hold():
     assert 3.0 < mean["norm"] < 10.0
 
 
+def test_robust_covariances_of_few_rows_hold():
+    """The robust weights of the small residuals of few rows exceed 1; they are no information."""
+    scores = []
+    for seed in range(50):
+        motion, *data = scene(seed, 2)
+        fit = register_images(RIG, *data, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM, loss="robust")
+        scores.append(mahalanobis2(fit, motion))
+    assert 4.6 < np.mean(scores) < 7.4
+
+
 def test_covariance_at_grows_with_distance():
     _, *data = scene(1)
     fit = register_images(RIG, *data)
