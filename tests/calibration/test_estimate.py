@@ -497,6 +497,15 @@ def test_a_mirrored_axis_that_looks_like_swapped_eyes_is_named_beside_them():
         calibrate(x * [1, -1, 1], u)
 
 
+def test_one_very_uncertain_row_does_not_hide_swapped_cameras():
+    x, u = good()
+    covariance_px2 = np.tile(np.eye(4), (len(x), 1, 1))
+    covariance_px2[5] *= 1e6
+    with pytest.raises(ValueError, match="swapped"):
+        calibrate(x, u[::-1], covariance_px2=covariance_px2)
+    assert calibrate(x, u, covariance_px2=covariance_px2).sigma_u_px < 3
+
+
 def test_a_head_whose_geometry_leaves_doubt_is_not_called_swapped():
     x, (u_left, u_right) = good()
     calibrate(x, [u_right, np.column_stack([1919 - u_left[:, 0], u_left[:, 1]])])  # one channel mirrored
