@@ -29,8 +29,9 @@ _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
 _NARROW = 0.05  # quantile of the distance between the tips: offsets turn the axes most where the tips are close
 #: Turned axes are preferred unless their log likelihood is lower by more than this.
 _AS_LIKELY = 3.0
-#: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them); derivatives' step.
-_FINITE, _STEP_PER_MM = 3.0, 1e-6
+#: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them), or, if negative, as
+#: mirrored images (a curved field may exceed three); step of its derivative.
+_FINITE, _MIRRORED, _STEP_PER_MM = 3.0, 8.0, 1e-6
 
 
 @single_threaded_blas()
@@ -139,7 +140,8 @@ def calibrate_as_shown(
     """`calibrate` with affine cameras, or with cameras at a finite distance if the detections show a significant one.
 
     It is significant if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
-    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.
+    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.  If
+    1/distance is negative by eight of them, a warning says that the images look mirrored.
 
     >>> from lib.simulator.rig import reference_rig
     >>> rng = np.random.default_rng(0)
@@ -155,6 +157,9 @@ def calibrate_as_shown(
         value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
         if value > _FINITE * sd:
             return calibrate(data, model=models[1], **options)
+        if value < -_MIRRORED * sd:
+            what = "farther things look larger, so the images look mirrored, and depths would have the wrong sign"
+            warnings.warn(f"u_left, u_right: {what}; flip both images, or use a right-handed robot frame.", stacklevel=2)
     return found
 
 
