@@ -231,8 +231,10 @@ def _calibrate(
     if weighting not in ("likelihood", "paper"):
         raise ValueError(f"weighting: expected 'likelihood' or 'paper', got {weighting!r}.")
     for name, value in (*known.items(), ("ransac_px", ransac_px)):
-        if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
-            raise ValueError(f"{name}: must not be negative, and sigma_u_px not zero, got {value}; None estimates it.")
+        endless = value == np.inf and name != "ransac_px"
+        if value is not None and (endless or not (value > 0 or (value == 0 and name != "sigma_u_px"))):
+            rule = "must be finite and not negative, and sigma_u_px not zero (ransac_px may be infinite)"
+            raise ValueError(f"{name}: {rule}, got {value}; None estimates it.")
     if np.isfinite(y).sum() < len(plan.parameter_names):
         raise DataError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():

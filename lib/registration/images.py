@@ -138,13 +138,16 @@ class _Observed:
     @classmethod
     def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> Self:
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
-        if not sigma_x_mm >= 0:
-            raise ValueError(f"sigma_x_mm: must not be negative, got {sigma_x_mm}.")
+        if not 0 <= sigma_x_mm < np.inf:
+            raise ValueError(f"sigma_x_mm: must be finite and not negative, got {sigma_x_mm}.")
         seen = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         check_spread(data.x_mm[seen.any(axis=1)], "x_mm (rows with a detection)")
         if covariance_px2 is None and np.isfinite(data.covariance_px2[seen]).all():
             covariance_px2 = np.where(np.isfinite(data.covariance_px2), data.covariance_px2, np.eye(2))
         covariance = pair_covariance(covariance_px2, len(data)) + sigma_x_mm**2 * rig.linear @ rig.linear.T
+        used = np.repeat(seen, 2, axis=1)
+        if not np.isfinite(np.where(used[:, :, None] & used[:, None], covariance, 0.0)).all():
+            raise ValueError("covariance_px2: must be finite where an image shows a landmark; drop rows of unknown noise.")
         # Rows and images that are not used get no information; their values only have to be finite.
         x = np.where(seen.any(axis=1, keepdims=True), data.x_mm, data.x_mm[seen.any(axis=1)].mean(axis=0))
         return cls(x, np.nan_to_num(data.stacked_px), covariance, seen, covariance_px2 is not None)

@@ -461,6 +461,7 @@ def test_bad_data_are_refused_with_the_reason(spoil, message):
         ({"sigma_u_px": -1.0}, "sigma_u_px"),
         ({"sigma_u_px": 0.0}, "sigma_u_px"),
         ({"sigma_x_mm": np.nan}, "sigma_x_mm"),
+        ({"sigma_x_mm": np.inf}, "sigma_x_mm: must be finite"),
         ({"ransac_px": -3.0}, "ransac_px"),
         ({"covariance_px2": np.eye(3)}, "covariance_px2"),
         ({"covariance_px2": -np.eye(4)}, "positive definite"),

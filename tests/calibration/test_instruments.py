@@ -154,6 +154,8 @@ def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
 
 def test_time_offset_at_the_edge_of_its_search_is_refused_with_the_cure():
     frames, robot = video(0.5, 0)
+    with pytest.raises(ValueError, match="search_s: half the width of the search must be positive"):
+        estimate_time_offset(frames, robot, search_s=-1)
     with pytest.raises(ValueError, match="^search_s: the search ends at its upper edge; widen search_s.$"):
         estimate_time_offset(frames, robot)
     assert estimate_time_offset(frames, robot, search_s=0.7).offset_s == pytest.approx(0.5, abs=1e-3)
@@ -274,6 +276,7 @@ def test_online_drops_gaps_and_gross_errors():
         u_right[1] += 300 * (i % 10 == 0)
         used = online.add(Correspondences.of_points(c.x_mm[rows], u_left, u_right))
         assert used.tolist() == [[False, True], [True, i % 10 > 0], [True, True]]
+    assert online.add(c.subset(slice(0))).shape == (0, 2)
     assert np.abs(online.solve().left.project(c.true_x_mm) - c.true_rig.left.project(c.true_x_mm)).max() < 2.0
 
 

@@ -294,8 +294,15 @@ def test_bad_noise():
     data = scene(0)[1:]
     with pytest.raises(ValueError, match="covariance_px2"):
         register_images(RIG, *data, covariance_px2=np.eye(3))
-    with pytest.raises(ValueError, match="sigma_x_mm"):
-        register_images(RIG, *data, sigma_x_mm=-1)
+    for sigma_x_mm in (-1, np.inf):
+        with pytest.raises(ValueError, match="sigma_x_mm"):
+            register_images(RIG, *data, sigma_x_mm=sigma_x_mm)
+    unknown = np.tile(np.eye(4), (len(data[0]), 1, 1))
+    unknown[2, :2, :2] = np.nan
+    with pytest.raises(ValueError, match="covariance_px2: must be finite where an image shows a landmark"):
+        register_images(RIG, *data, covariance_px2=unknown)
+    data[1][2] = np.nan  # not seen: its noise does not matter
+    assert np.isfinite(register_images(RIG, *data, covariance_px2=unknown).covariance).all()
 
 
 # --- cameras that move apart -----------------------------------------------------------------------------------------
