@@ -93,12 +93,12 @@ def estimate_noise(
     scoring maximises the likelihood of the residuals along the eigenvectors of A A^T, for the `views` (n, m / 2) bool of
     each row (None = all).  Single views have no epipolar direction: without pairs sigma_x is 0 unless one level is given.
     `parameters` is the number of fitted parameters.  A given level is kept.  `claimed_px2` (1 or n, m, m), a detector's
-    covariances, take the place of I: one factor of 1 or more scales them, and sigma_u is that of the median row.
+    covariances, take the place of I: one factor of 1 or more scales them, and sigma_u is their `noise_rms_px`.
     """
     n, m = residuals.shape
     code = np.full(n, 3) if views is None else views @ [1, 2][: m // 2]
     claimed = np.eye(m)[None] if claimed_px2 is None else claimed_px2
-    unit = typical_noise_px(claimed)
+    unit = noise_rms_px(claimed)
     least = np.array([0.0 if claimed_px2 is None else 1.0, 0.0])
     count = 2.0 * ((code & 1).sum() + (code >> 1).sum() * (m > 2))
     known = np.array([np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)])
@@ -137,6 +137,7 @@ def estimate_noise(
     return float(unit * np.sqrt(new[0])), float(np.sqrt(new[1]))
 
 
-def typical_noise_px(covariance_px2: np.ndarray) -> float:
-    """Standard deviation of a pixel coordinate over covariances (n, m, m): of the median row, since a few dominate a mean."""
-    return float(np.sqrt(np.median(np.trace(covariance_px2, axis1=1, axis2=2)) / covariance_px2.shape[1]))
+def noise_rms_px(covariance_px2: np.ndarray) -> float:
+    """RMS standard deviation of a pixel coordinate over covariances (n, m, m), each at most three times the median one."""
+    variance = np.trace(covariance_px2, axis1=1, axis2=2) / covariance_px2.shape[1]
+    return float(np.sqrt(np.minimum(variance, 9.0 * np.median(variance)).mean()))  # else one row may decide

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration import checks as refuse
-from lib.calibration.affine import affine_minimum, estimate_noise, paper_variances, regress, typical_noise_px
+from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
 from lib.calibration.offsets import Unsettled, estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
@@ -261,7 +261,7 @@ def _calibrate(
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
         used = x[inliers], y[inliers], views[inliers], rows_noise
         minimum, (sigma_u, sigma_x) = _minimise(plan, *used, weighting, known, image_size_px)
-        scale = sigma_u / typical_noise_px(claimed if rows_noise is None else rows_noise)
+        scale = sigma_u / noise_rms_px(claimed if rows_noise is None else rows_noise)
         f, J, _ = minimum.state.evaluate(x, derivatives=False)
         residuals = y - f
         if final:
@@ -321,7 +321,7 @@ def _minimise(
             break
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
         claimed = np.eye(m)[None] if noise is None or weighting == "paper" else noise
-        weigh = variance_u * claimed / typical_noise_px(claimed) ** 2
+        weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
         anew = minimum is None or (plan.base == "affine" and plan.is_affine and whole and len(weigh) == 1)
         if anew and whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
