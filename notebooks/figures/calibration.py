@@ -146,7 +146,7 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
         delta = [rung.bic - comparison.best.bic for rung in comparison.rungs]
         colours = [COLOURS["ours"] if rung is comparison.best else COLOURS["baseline"] for rung in comparison.rungs]
         bars = ax.barh(names, delta, color=colours)
-        labels = ["chosen" if rung is comparison.best else f"{rung.bic - comparison.best.bic:.0f}" for rung in comparison.rungs]
+        labels = ["chosen" if above == 0 else f"{above:.0f}" for above in delta]
         ax.bar_label(bars, labels, padding=3, fontsize=8)
         ax.set(xscale="symlog", xlim=(0, 5 * (most + 1)), xlabel="BIC minus that of the best model", title=title)
         ax.xaxis.set_major_formatter("{x:g}")
