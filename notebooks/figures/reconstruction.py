@@ -347,7 +347,10 @@ def score_table(
 
 
 def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
-    """Maps (h, w) of errors over the image, NaN where unknown, on the same colour scale."""
+    """Maps (h, w) of errors over the image, NaN where unknown, on the same colour scale.
+
+    The scale ends at `limit_um`; None = at the 98th percentile of all errors.  The colour bar states its end.
+    """
     if limit_um is None:
         limit_um = float(np.nanpercentile(np.abs(np.concatenate([m.ravel() for m in maps_um.values()])), 98))
     page, axes = figure(1, len(maps_um), width_in=4.6 * len(maps_um), height_in=2.9, squeeze=False)
@@ -356,7 +359,8 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
         show_image(ax, values, f"{name}: {rms:.1f} um RMS")
         ax.images[0].set(cmap=_SIGNED if signed else _ERROR, clim=(-limit_um if signed else 0, limit_um))
         ax.set_facecolor("#dddddd")
-    page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label="depth error (um)" if signed else "um", shrink=0.85)
+    ends = f"depth error (um), up to ±{limit_um:.2g}" if signed else f"error (um), up to {limit_um:.2g}"
+    page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label=ends, extend="both" if signed else "max", shrink=0.85)
     return page
 
 
