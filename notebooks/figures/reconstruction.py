@@ -367,7 +367,7 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
         show_image(ax, values, f"{name}: {rms:.1f} um RMS")
         ax.images[0].set(cmap=_SIGNED if signed else _ERROR, clim=(-limit_um if signed else 0, limit_um))
         ax.set_facecolor("#dddddd")
-    ends = f"depth error (um), up to ±{limit_um:.2g}" if signed else f"error (um), up to {limit_um:.2g}"
+    ends = f"depth error (um), colours end at ±{limit_um:.2g}" if signed else f"error (um), colours end at {limit_um:.2g}"
     page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label=ends, extend="both" if signed else "max", shrink=0.85)
     return page
 
