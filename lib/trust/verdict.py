@@ -250,10 +250,11 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     if c.rig is None:
         return
     ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))
-    yield "zoom_ratio", ratio, f"One camera's zoom is {ratio:.2f} times the other's.", cure, name
+    unless = f"{cure} If the cameras are built so, nothing is wrong."
+    yield "zoom_ratio", ratio, f"One camera's zoom is {ratio:.2f} times the other's.", unless, name
     angle = np.rad2deg(c.rig.convergence_rad)
     text = f"The cameras converge by {min(angle, 180 - angle):.1f} degrees; a stereo microscope's by 2 to 20."
-    yield "convergence_high", min(angle, 180 - angle), text, cure, name
+    yield "convergence_high", min(angle, 180 - angle), text, unless, name
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
     mirrored, roll = optics(c).mirrored, abs(np.rad2deg(optics(c).roll_rad))
