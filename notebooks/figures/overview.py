@@ -63,8 +63,8 @@ def pipeline_page(
     registration_um:
         Method -> numbers of frames (k,) and translation errors (k,) in um; empty without a calibration of half the frames.
     """
-    page = plt.figure(figsize=(13, 7.4), layout="constrained", facecolor="white")
-    grid = page.add_gridspec(2, 3)
+    page = plt.figure(figsize=(13, 6.8), layout="constrained", facecolor="white")
+    grid = page.add_gridspec(2, 3, height_ratios=(3, 4))
     title = {"loc": "left", "fontweight": "bold", "fontsize": 11}
 
     ax = show_image(page.add_subplot(grid[0, 0]), left)
@@ -75,7 +75,8 @@ def pipeline_page(
     for columns, side in ((slice(0, 2), "left"), (slice(2, 4), "right")):
         ax.plot(*residuals_px[:, columns].T, ".", color=COLOURS[side], markersize=4, alpha=0.6, label=side)
     radius = 1.1 * np.nanquantile(np.abs(residuals_px), 0.995)
-    ax.set(xlim=(-radius, radius), ylim=(-radius, radius), aspect="equal", xlabel="x, px", ylabel="y, px")
+    ax.set(xlim=(-radius, radius), ylim=(-radius, radius), xlabel="x, px", ylabel="y, px")
+    ax.set_aspect("equal", adjustable="datalim")  # fills its place
     ax.legend(fontsize=8)
     ax.set_title("2  Calibration residuals", **title)
 
