@@ -30,7 +30,7 @@ from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
-from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
+from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8, images_for
 from lib.landmarks.search import PEAKS, best_tools, likelihood, near_only, several_peaks
 from lib.parallel import single_threaded_torch
 
@@ -245,6 +245,8 @@ class Detector:
         detector then first looks at the difference from them.  Raises ValueError for another shape, type or range.
         """
         images = as_uint8(images)
+        if batch not in range(1, 1 << 30):
+            raise ValueError(f"batch: expected a number of images, 1 or more, got {batch}.")
         with self._threads():
             parts = (slice(start, start + batch) for start in range(0, len(images), batch))
             return Landmarks.join([self._seen(images[p], ground and (lambda p=p: ground()[p])) for p in parts])
@@ -282,9 +284,7 @@ class Detector:
 
         Only closeups are used.  An image with a landmark below `min_confidence` is searched as in a call, with `ground`.
         """
-        images = as_uint8(images)
-        if len(previous) != len(images):
-            raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
+        images = images_for(previous, "previous", images)
         if self.closeup_network is None:
             return self(images, ground=ground)
         usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
@@ -304,7 +304,7 @@ class Detector:
         Detections farther away than `NEAR` are missing.  With `reach`, a share of the tool's length, only peaks within it
         count.  With `ground`, as in a call, each landmark is that of the image or of the levelled image, the surer.
         """
-        images, known = as_uint8(images), np.isfinite(u).all(axis=2)
+        images, known = images_for(u, "u", images), np.isfinite(u).all(axis=2)
         known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
         u = np.where(known[..., None], u, np.nan)
         found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))

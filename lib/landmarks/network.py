@@ -9,6 +9,7 @@ The offset network is not in the paper: it measures one landmark that an hourgla
 from __future__ import annotations
 
 import copy
+from collections.abc import Sized
 from dataclasses import dataclass
 from typing import Self
 
@@ -267,9 +268,19 @@ def as_uint8(images: ArrayLike) -> np.ndarray:
     if not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"images: expected uint8 or float, got {array.dtype}; divide by the largest value.")
     low, high = float(array.min()), float(array.max())
+    if np.isnan(low):
+        raise ValueError("images: float images must lie in [0, 1], but some pixels are NaN; replace them, such as by 0.")
     if not (low >= 0.0 and high <= 1.0):
         raise ValueError(f"images: float images must lie in [0, 1], got {low:g} to {high:g}; divide by 255?")
     return np.round(array * 255).astype(np.uint8)
+
+
+def images_for(values: Sized, name: str, images: ArrayLike) -> np.ndarray:
+    """Convert images by `as_uint8`; a ValueError names the argument `name` if it does not hold a value for each image."""
+    images = as_uint8(images)
+    if len(values) != len(images):
+        raise ValueError(f"{name}: holds {len(values)} images, but images {len(images)}; give one for each.")
+    return images
 
 
 def as_tensor(images: ArrayLike) -> Tensor:

@@ -34,7 +34,7 @@ OFF_LINE = 1
 NEAR_OFF_LINE = {"fast": 2, "quality": 4}
 COARSE_OFF_LINE = 5
 COARSE_WIDTH_PX = 256
-#: Half width of the coarse search, as a fraction of the canvas.
+#: Half width of the coarse search of images of equal width, as a fraction of the canvas.
 COARSE_REACH = 0.2
 #: Least number of coarse matches that agree, for checking the rig and finding the depth range; with fewer there is no match.
 MIN_SUPPORTED = 12
@@ -57,13 +57,13 @@ RIDGE = 0.05
 
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
-) -> tuple[Rectification, float, tuple[float, float], float, bool]:
+) -> tuple[Rectification, float, tuple[float, float], float] | None:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth if it is not given.
 
     Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
-    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and whether the images
-    show that they belong together: enough coarse matches agree, or the range was given.  A ValueError refuses a rig that
-    does not fit the images, and a depth range that the cameras do not share.
+    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing).  None if the range is not
+    given and too few coarse matches agree, such as in images of noise, which match somewhere: then nothing is to be matched.
+    A ValueError refuses a rig that does not fit the images, and a depth range that the cameras do not share.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -72,9 +72,8 @@ def plan_search(
     scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
     if depth_range_mm is not None and np.isinf(max_epipolar_px):
-        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, True
-    displacement = _coarse_displacement(images, masks, rig, whole)
-    off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
+        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0
+    displacement, off_line_px = _coarse_displacement(images, masks, rig, whole), 0.0
     if len(displacement) >= MIN_SUPPORTED:
         misfit = float(np.median(np.abs(displacement[:, 1])))
         if misfit > max_epipolar_px:
@@ -85,11 +84,17 @@ def plan_search(
         off_line_px = float(np.median(displacement[:, 1]))
         low, high = np.percentile(displacement[:, 0], (0.5, 99.5))
         margin = 4 / min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
-        range_px = float(low - margin), float(high + margin)
-    range_mm = whole.depth_range_mm(range_px) if depth_range_mm is None else depth_range_mm
+        depth_range_mm = whole.depth_range_mm((low - margin, high + margin)) if depth_range_mm is None else depth_range_mm
+    if depth_range_mm is None:
+        return None
     off_line_px = off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0
-    supported = depth_range_mm is not None or len(displacement) >= MIN_SUPPORTED
-    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, supported
+    return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), off_line_px
+
+
+def coarse_reach_px(rectification: Rectification, shape_right: tuple[int, int]) -> float:
+    """Half width of the coarse search in canvas px: more if one image is wider, since the other may show any part of it."""
+    width, (low, high) = rectification.size_px[0], rectification.shared_range_px(shape_right)
+    return COARSE_REACH * width + abs(high - low - 2 * width) / 2
 
 
 def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> np.ndarray:
@@ -98,7 +103,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     """
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
-    reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
+    reach = int(np.ceil(coarse_reach_px(rectification, images[1].shape) / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
     matches = _match(left, right, -reach, COARSE_OFF_LINE)[0]  # the volume is large
     # Keep matches with at least three neighbours on the lattice whose displacement is the same within 1.5 cells.
@@ -109,10 +114,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     chosen = matches.keep((np.abs(apart).max(axis=2, initial=0) <= 1.5).sum(axis=0) > 3)  # each match counts itself
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
-    displacement = (chosen.cell + step) * CELL_PX / scale
-    # The reference depths of the two canvases differ because each is rounded to whole pixels of its own canvas.
-    displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
-    return displacement
+    return (chosen.cell + step) * CELL_PX / scale
 
 
 def _descriptors(
@@ -151,10 +153,10 @@ def _match(
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
-    rectification, _, range_px, off_line_px, supported = plan_search(images, masks, rig, where)
-    if not supported:  # such as two images of noise, which match somewhere
-        none, u = np.zeros(0), np.zeros((0, 2))
-        return Matches(u, u, none, np.zeros((0, 4, 4)), peak_ratio=none, reciprocal=none.astype(bool), method="band")
+    plan = plan_search(images, masks, rig, where)
+    if plan is None:
+        return Matches.none("band")
+    rectification, _, range_px, off_line_px = plan
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
     off_line = OFF_LINE if rig.is_affine else NEAR_OFF_LINE[where[0]]

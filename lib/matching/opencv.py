@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.band import CELL_PX, COARSE_REACH, DOWNSCALE, Images, Masks, Where, plan_search
+from lib.matching.band import CELL_PX, DOWNSCALE, Images, Masks, Where, coarse_reach_px, plan_search
 from lib.matching.deepmatching import correlation_volume, peak_ratio
 from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import on_image, warp
@@ -66,11 +66,14 @@ def match_with(
     named = isinstance(function, str)
     call = {"sgbm": partial(_sgbm, checked=reciprocal), "dis": _dis}[function] if named else function
     name = function if named else getattr(function, "__name__", "callable")
-    rectification, scale, (low, high), *_ = plan_search(images, masks, rig, where)
+    plan = plan_search(images, masks, rig, where)
+    if plan is None:
+        return Matches.none(name)
+    rectification, scale, (low, high), _ = plan
 
     # Matchers only find points inside both canvases, so widen the canvas by the largest displacement.
     width, height = rectification.size_px
-    reach = min(int(np.ceil(max(abs(low), abs(high)))), int(COARSE_REACH * 2 * width))
+    reach = min(int(np.ceil(max(abs(low), abs(high)))), int(2 * coarse_reach_px(rectification, images[1].shape)))
     reach = -(-reach // LATTICE_PX) * LATTICE_PX
     size, shift = (width + 2 * reach, height), (-reach, 0)
     left, valid_left = warp(images[0], rectification.left_from_canvas, size, shift_px=shift, mask=masks[0])

@@ -32,15 +32,19 @@ class Rectification:
         ends = self.reference_depth_mm + np.asarray(displacement_range_px) / self.displacement_px_per_mm
         return float(ends.min()), float(ends.max())
 
+    def shared_range_px(self, shape_right: tuple[int, int]) -> tuple[float, float]:
+        """(low, high) displacements at which both images, the right one of the shape (h, w), have a column in common."""
+        corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
+        x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
+        return float(x.min() - self.size_px[0]), float(x.max())
+
     def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
         """(low, high) displacements of a range of depth, limited to the part that both cameras see; `shape_right` is (h, w).
 
         If they see nothing of it, a ValueError states the depths that they see.
         """
         low, high = np.sort(np.subtract(depth_range_mm, self.reference_depth_mm) * self.displacement_px_per_mm).tolist()
-        corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
-        x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
-        visible = float(x.min() - self.size_px[0]), float(x.max())
+        visible = self.shared_range_px(shape_right)
         if high < visible[0] or low > visible[1]:
             near, far = self.depth_range_mm(visible)
             what = f"nothing from {depth_range_mm[0]:g} to {depth_range_mm[1]:g} mm along the left viewing direction"
@@ -74,12 +78,14 @@ def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int,
     at_zero = H @ (left[:, 2] - rig.left.offset_px) + rig.right.offset_px
     right_linear = H @ left[:, :2]
 
-    # At the reference depth the image centres coincide, up to whole pixels, so that a rectified pair is not resampled.
+    # At the reference depth the middle pixels lie together, up to the shift off the line.  So the canvas does not depend on
+    # the origin of the rig's frame, and a rectified pair is moved by whole pixels, thus not resampled.
+    middle_left, middle_right = np.array(shape_left[::-1]) // 2, np.array(shape_right[::-1]) // 2
+    gap = middle_right - (H @ (middle_left - rig.left.offset_px) + rig.right.offset_px)
+    shift_px = float(np.linalg.solve(right_linear, gap)[0])
     displacement = float(scale * direction @ shift)
-    gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ ((np.array(size) - 1) / 2) + at_zero)
-    whole = np.rint(np.linalg.solve(right_linear, gap)[0])
-    right = np.column_stack([right_linear, at_zero + right_linear @ np.array([whole, 0.0])])
-    return Rectification(left, right, size, displacement, whole / displacement)
+    right = np.column_stack([right_linear, at_zero + right_linear @ np.array([shift_px, 0.0])])
+    return Rectification(left, right, size, displacement, shift_px / displacement)
 
 
 def warp(

@@ -34,6 +34,12 @@ class Matches:
     method: str
     epipolar_px: float = float("nan")
 
+    @classmethod
+    def none(cls, method: str) -> Self:
+        """The result of a matcher that found nothing."""
+        empty, u = np.zeros(0), np.zeros((0, 2))
+        return cls(u, u, empty, np.zeros((0, 4, 4)), peak_ratio=empty, reciprocal=empty.astype(bool), method=method)
+
     def __len__(self) -> int:
         return len(self.u_left)
 

@@ -53,10 +53,14 @@ def surface_mesh(
     Args:
         step_px: Largest distance of neighbouring vertices in the left image.
         image: (h, w, 3) uint8 RGB left image for the texture.
-        mask: (h, w) bool, True where the surface is shown; None is everywhere.  A ValueError refuses a mask that hides all.
+        mask: (h, w) bool of the left image, True where the surface is shown; None is everywhere.  Not all may be hidden.
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
+    if mask is not None:
+        fits = mask.ndim == 2 and (np.array(mask.shape[::-1]) - 0.5 >= surface.grid.domain[2:]).all()
+        if not fits or (image is not None and mask.shape != image.shape[:2]):
+            raise ValueError(f"mask: expected (h, w) of the left image, which holds the surface's domain, got {mask.shape}.")
     ends = np.reshape(surface.grid.domain, (2, 2)).T
     x, y = (np.linspace(low, high, int(np.ceil((high - low) / step_px)) + 1) for low, high in ends)
     u = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

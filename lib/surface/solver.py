@@ -112,9 +112,9 @@ def _interior_point(
     centre = w @ x / total
     x = x - centre
 
-    # The initial value is a least-squares spline; its residuals give the unit of length.
+    # The initial value is a least-squares spline, not too stiff for rounding; its residuals give the unit of length.
     unit = max(np.abs(x).max(), 1e-9)  # x may be constant
-    if (factor := cholesky(problem.normal_band(w, 2 * mu / unit))) is None:
+    if (factor := cholesky(problem.normal_band(w, 2 * min(mu / unit, 1e12)))) is None:
         raise ValueError(UNHELD)
     c = dpbtrs(factor, B_T @ (w * x), lower=1)[0]
     residual = B @ c - x

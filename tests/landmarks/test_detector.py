@@ -196,7 +196,7 @@ def test_what_the_stage_before_found_is_evidence(images):
         (np.zeros((1, 64, 64, 4), np.uint8), "alpha"),
         (np.zeros((64, 64, 3), np.uint8), "first axis"),
         (np.full((1, 64, 64, 3), 200.0), r"must lie in \[0, 1\]"),
-        (np.full((1, 64, 64, 3), np.nan), r"must lie in \[0, 1\]"),
+        (np.full((1, 64, 64, 3), np.nan), r"must lie in \[0, 1\], but some pixels are NaN"),
         (np.zeros((1, 64, 64, 3), np.int32), "int32"),
         (np.zeros((0, 64, 64, 3), np.uint8), "empty"),
     ],
@@ -206,6 +206,17 @@ def test_bad_images_are_named(bad, text):
         untrained()(bad)
     with pytest.raises(ValueError, match="images: "):
         as_tensor(bad)
+
+
+def test_each_image_needs_its_expected_positions(images):
+    with pytest.raises(ValueError, match="u: holds 1 images, but images 2"):
+        untrained().near(images, np.zeros((1, 3, 2)))
+
+
+@pytest.mark.parametrize("batch", [0, -1, 2.5])
+def test_a_batch_has_one_image_or_more(images, batch):
+    with pytest.raises(ValueError, match="batch: "):
+        untrained()(images, batch=batch)
 
 
 def test_a_closeup_moves_what_the_stage_before_found(images):

@@ -210,6 +210,26 @@ def test_sizes_may_differ(textured, method):
     assert (matches.u_right[:, 0] < 130).all() and (matches.u_right[:, 1] < 104).all()
 
 
+@pytest.mark.parametrize("method", ["band", "sgbm", "dis"])
+@pytest.mark.parametrize(("first", "last"), [(0, 400), (100, 300), (200, 400)])
+def test_a_rectified_pair_of_different_sizes_matches_at_its_true_shift(method, first, last):
+    """The left image shows a part of what the right one shows: any part, so that the middles of the images differ."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, (96, 620)), (0, 0), 2)
+    scene = np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
+    left, right = scene[:, 20 + first : 20 + last], scene[:, 10:610]
+    for pair, shift_px in (((left, right), first + 10), ((right, left), -first - 10)):
+        matches = match(*pair, method=method, rig=RECTIFIED)
+        assert len(matches) > 150
+        assert abs(np.median(matches.u_right[:, 0] - matches.u_left[:, 0]) - shift_px) < 0.1
+
+
+@pytest.mark.parametrize("method", ["band", "sgbm", "dis", lambda left, _, range_px: (0.0 * left, 0.0 * left + 1)])
+def test_images_that_do_not_belong_together_give_no_match(textured, method):
+    """Nothing fits a blank image, but a dense matcher returns a disparity everywhere, with confidence."""
+    blank = np.clip(np.random.default_rng(0).normal(60, 2, textured.shape), 0, 255).astype(np.uint8)
+    assert not len(match(textured, blank, method=method, rig=RECTIFIED))
+
+
 def test_epipolar_lines_of_near_cameras_are_followed():
     """At 25 mm they deviate from the canvas's rows by up to 10 px, most of all in the corners."""
     geometry = {"image_size_px": (640, 360), "pixels_per_mm": (34, 34), "inverse_distance_per_mm": 1 / 25}

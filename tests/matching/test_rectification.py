@@ -61,6 +61,25 @@ def test_a_rectified_pair_is_left_alone():
     assert np.allclose(points.x_mm, (40, 20, 12))
 
 
+@pytest.mark.parametrize("sizes", [((50, 70), (50, 90)), ((50, 70), (40, 61)), ((31, 33), (50, 70))])
+def test_a_rectified_pair_of_different_sizes_is_moved_by_whole_pixels(sizes):
+    found = rectify(RECTIFIED, *sizes)
+    moved = found.right_from_canvas - np.eye(2, 3)
+    assert np.array_equal(moved, np.rint(moved)) and not moved[1].any()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.44])
+def test_the_canvas_does_not_depend_on_the_origin_of_the_robots_frame(scale):
+    """The same cameras: a surface must not change by micrometres if the robot counts its millimetres from elsewhere."""
+    rig, shape = reference_rig(), (1080, 1920)
+    here = rectify(rig, shape, shape, scale=scale)
+    for along_mm in (0.05, 0.13, 250.0):
+        to = RigidTransform(np.eye(3), along_mm * rig.left.viewing_direction + (3.0, -2.0, 1.0))
+        there = rectify(rig.moved(to), shape, shape, scale=scale)
+        assert np.allclose(there.left_from_canvas, here.left_from_canvas)
+        assert np.allclose(there.right_from_canvas, here.right_from_canvas)
+
+
 def test_warping_shifts_masks_and_shrinks_without_moving():
     rng = np.random.default_rng(0)
     image = rng.uniform(0, 255, (40, 60)).astype(np.float32)

@@ -68,6 +68,17 @@ def test_mask_hides_triangles(surface):
         surface_mesh(surface, mask=np.zeros_like(mask))
 
 
+@pytest.mark.parametrize("size", [(10, 10), (1080, 960), (1920, 1080), (1080,)])
+def test_a_mask_of_another_image_is_refused(surface, size):
+    with pytest.raises(ValueError, match="mask: expected"):
+        surface_mesh(surface, mask=np.ones(size, dtype=bool))
+
+
+def test_a_mask_has_the_size_of_the_texture(surface, image):
+    with pytest.raises(ValueError, match="mask: expected"):
+        surface_mesh(surface, image=image, mask=np.ones((1200, 2000), dtype=bool))
+
+
 @pytest.mark.parametrize("textured", [True, False])
 def test_glb_is_glTF_in_metres_with_its_texture(surface, image, tmp_path, textured):
     mesh = surface_mesh(surface, step_px=60, image=image if textured else None)

@@ -158,6 +158,39 @@ def test_planes_and_exact_data_are_fine(slope):
     np.testing.assert_allclose(surface(u), x, atol=1e-6)
 
 
+@pytest.mark.parametrize("smoothness", [None, 1.0, 1e18])
+def test_a_plane_that_faces_the_camera_is_fitted_exactly(bowl, smoothness):
+    """It has one depth, so nothing in the data tells how stiff the surface may be."""
+    camera, u = bowl.rig.left, bowl.u_left
+    plane = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T + 3 * camera.viewing_direction
+    found = fit_surface(u, plane, domain=bowl.domain, control=(8, 8), camera=camera, smoothness=smoothness)
+    inside = found.grid.inside(u)
+    np.testing.assert_allclose(found(u[inside]), plane[inside], atol=1e-6)
+
+
+def test_points_without_scatter_have_no_covariance():
+    u = np.random.default_rng(0).uniform(0, 100, (200, 2))
+    surface = fit_surface(u, np.column_stack([u / 100, 0 * u[:, 0]]), domain=(0, 0, 100, 100), control=(8, 8))
+    with pytest.raises(ValueError, match="covariance: the surface passes through all its points"):
+        surface.covariance(u)
+
+
+def test_uncertainty_in_a_hole_fits_the_bending_around_it():
+    """Dense matches on waves: the smoothness of least error alone promises a third of the error below a mask."""
+    u = np.random.default_rng(0).uniform(0, (600, 400), (3000, 2))
+    u = u[np.abs(u - (300, 200)).max(axis=1) > 90]
+    hole = np.stack(np.meshgrid(np.linspace(240, 360, 9), np.linspace(140, 260, 9)), axis=-1).reshape(-1, 2)
+
+    def waves(u: np.ndarray, noise_mm: float = 0.0) -> np.ndarray:
+        z = 0.3 * np.sin(u[:, 0] / 35) * np.cos(u[:, 1] / 45)
+        return np.column_stack([u / 100, z]) + np.random.default_rng(1).normal(0, noise_mm, (len(u), 3))
+
+    surface = fit_surface(u, waves(u, 0.02), domain=(0, 0, 600, 400), control=(20, 16))
+    error, sigma = (surface(hole) - waves(hole))[:, 2], np.sqrt(surface.covariance(hole)[:, 2, 2])
+    assert rms(error) > 0.03 and rms(error / sigma) < 1.5
+    assert np.median(np.sqrt(surface.covariance(u[:200])[:, 2, 2])) < 0.01  # where points are, they decide
+
+
 def test_a_hole_without_smoothness_is_refused_or_its_uncertainty_is_stated(bowl_factory):
     """Without smoothness nothing holds the surface over a hole in the data: it may leave the truth by metres."""
     bowl = bowl_factory(2000)
