@@ -15,6 +15,8 @@ from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
+#: Least number of matches from which the bend of all epipolar lines is estimated; with fewer only their common shift is.
+_BENDING = 100
 #: For `refine_rig`: number of correlated matches that count as one; standard deviations above which residuals lose weight.
 _CORRELATED, _SOFT = 10.0, 2.0
 
@@ -55,13 +57,18 @@ class Reconstruction:
 def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
     """Mask (n,) of the matches within `EPIPOLAR_SIGMAS` of their standard deviations from their epipolar lines.
 
-    The median distance is subtracted first: a calibration error may shift all epipolar lines by part of a pixel.  Matches
-    that no point explains are dropped.
+    An error of the calibration shifts, turns and bends all epipolar lines by up to some pixels.  So a robust quadratic
+    function of the left image point is subtracted from the distances first.  Matches that no point explains are dropped.
     """
-    if not len(matches):
-        return np.zeros(0, dtype=bool)
-    distance = rig.epipolar_distance(matches.u_left, matches.u_right)
-    return np.abs(distance - np.nanmedian(distance)) < EPIPOLAR_SIGMAS * matches.sigma_along(rig.epipolar_normal)
+    distance, sigma = rig.epipolar_distance(matches.u_left, matches.u_right), matches.sigma_along(rig.epipolar_normal)
+    known = np.isfinite(distance)
+    common = np.median(distance[known]) if known.any() else 0.0
+    if known.sum() >= _BENDING:
+        x, y = ((matches.u_left - matches.u_left.mean(axis=0)) / np.maximum(matches.u_left.std(axis=0), 1)).T
+        bend = np.column_stack([x * x, x * y, y * y, x, y])
+        found, _ = _regression(bend[known], distance[known] - common, sigma[known])
+        common = common + bend @ found[:-1] + found[-1]
+    return np.abs(distance - common) < EPIPOLAR_SIGMAS * sigma
 
 
 def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
@@ -100,7 +107,7 @@ def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> Ster
 
 
 def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Robust coefficients (4,) of value (n,) on [x; 1], and their information, by iteratively reweighted least squares."""
+    """Robust coefficients (k + 1,) of value (n,) on [x; 1], x (n, k), and their information: reweighted least squares."""
     design = np.column_stack([x, np.ones(len(x))]) / sigma[:, None]
     target, weight = value / sigma, np.ones(len(x))
     for _ in range(20):

@@ -89,6 +89,18 @@ def test_epipolar_filter_drops_what_is_off_the_line(scene, result):
     assert not len(epipolar_inliers(scene.rig, matches.keep(np.zeros(len(matches), dtype=bool))))
 
 
+def test_epipolar_filter_allows_for_lines_that_a_wrong_calibration_turns_and_bends(scene, result):
+    """Else it would keep the matches of one stripe of the image, and wrong ones beside it."""
+    matches, (width, height) = result.matches, (640, 360)
+    x, y = (matches.u_left / (width, height) - 0.5).T
+    off = (3 * x - 4 * y + 2 * x * y + y**2)[:, None] * scene.rig.epipolar_normal[2:]
+    wrong = np.arange(len(matches)) % 5 == 0
+    off[wrong] += 5 * scene.rig.epipolar_normal[2:]
+    off /= np.sum(scene.rig.epipolar_normal[2:] ** 2)  # now px of distance from the lines
+    kept = epipolar_inliers(scene.rig, replace(matches, u_right=matches.u_right + off))
+    assert kept[~wrong].mean() > 0.9 and kept[wrong].mean() < 0.02
+
+
 def test_a_match_that_no_point_explains_is_dropped_alone(scene, result):
     """Barrel distortion, if it is estimated too strong, images nothing at the corners: their distance is NaN."""
     barrel = NearAffineCamera(scene.rig.left.matrix, 0.0, (320, 180), radial_per_px2=-2e-6)
