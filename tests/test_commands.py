@@ -201,10 +201,12 @@ def test_a_tool_without_labels_is_masked_where_the_robot_reports_it(out, tmp_pat
     assert np.abs(tools_px[0] - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
     rows.x_mm[rows.frame == 2] = np.nan  # the robot does not know either
     monkeypatch.setattr(commands, "_FEW", 1.0)
+    monkeypatch.setattr(commands, "AMBIGUOUS", -1.0)
     assert commands.main_reconstruct(argv) == 0
     said = capsys.readouterr().out
     assert "The surface may include the tool" in said and "--setting fast may be more accurate" in said
-    assert "tool_not_masked" in (tmp_path / "reconstruction.json").read_text()
+    named = {reason["name"] for reason in json.loads((tmp_path / "reconstruction.json").read_text())["reasons"]}
+    assert {"tool_not_masked", "ambiguous_texture"} <= named
 
 
 def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, capsys):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from lib.calibration import Calibration
 from lib.cameras import AffineCamera, Points, StereoRig
@@ -17,6 +18,11 @@ from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface
 EPIPOLAR_SIGMAS = 2.0
 #: Least number of matches from which the bend of all epipolar lines is estimated; with fewer only their common shift is.
 _BENDING = 100
+#: Share of ambiguous matches (`Matches.ambiguous`) above which the texture repeats too much to be trusted; on dots printed
+#: in a grid, 12 % of the matches were ambiguous and the surface was right.
+AMBIGUOUS = 0.25
+#: Points whose third nearest neighbour is this many times as far as usual are dropped.
+_ALONE = 6.0
 #: For `refine_rig`: number of correlated matches that count as one; standard deviations above which residuals lose weight.
 _CORRELATED, _SOFT = 10.0, 2.0
 
@@ -28,8 +34,8 @@ class Reconstruction:
     Attributes:
         surface: Fitted to `points` over the left image points `u`.
         points: The triangulated points, with their covariances.
-        matches: The matches that passed the epipolar filter, one for each point.
-        n_matches: Number of matches before the filter.
+        matches: The matches that passed the epipolar filter, and whose points have neighbours; one for each point.
+        n_matches: Number of matches before these filters.
         mask_left: (h, w) bool, True where tool, glints or darkness hid the surface.
         rig: The cameras that triangulated the points: as given, or refined by the matches.
         seconds: Wall clock of each stage: "mask", "refine" (if the rig was refined), "match", "triangulate", "surface".
@@ -69,6 +75,12 @@ def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
         found, _ = _regression(bend[known], distance[known] - common, sigma[known])
         common = common + bend @ found[:-1] + found[-1]
     return np.abs(distance - common) < EPIPOLAR_SIGMAS * sigma
+
+
+def in_company(x_mm: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the points that are not alone: between textured parts a surface would pass through a wrong one."""
+    third = KDTree(x_mm).query(x_mm, k=4)[0][:, 3]  # the first is the point itself; infinite with fewer points
+    return third <= _ALONE * np.median(third) if len(x_mm) else np.zeros(0, dtype=bool)
 
 
 def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
@@ -185,10 +197,13 @@ def reconstruct(
     with _timed(seconds, "triangulate"):
         matches = found.keep(epipolar_inliers(rig, found))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
+        accompanied = in_company(points.x_mm)
+        matches, points = matches.keep(accompanied), points.keep(accompanied)
     with _timed(seconds, "surface"):
         if len(matches) < (least := fewest_points(control)):
             cure = "Are both images sharp and textured, do they show the same part, does the rig fit?"
             cure += "" if fast else " In smooth images setting='fast' finds more."
+            cure += " The texture repeats, so most matches fit several places." if found.ambiguous > 0.5 else ""
             raise ValueError(f"left, right: {len(matches)} matches lie on their epipolar lines; {least} are needed. {cure}")
         domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
         depth_only = fast and rig.is_affine if depth_only is None else depth_only

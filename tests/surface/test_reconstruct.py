@@ -20,6 +20,7 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.render import render_pair
 from lib.simulator.rig import Microscope
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
+from lib.surface.reconstruct import in_company
 from lib.workbench import results
 from notebooks import real_data
 from notebooks.studies import surface_evaluation as evaluation
@@ -109,6 +110,14 @@ def test_a_match_that_no_point_explains_is_dropped_alone(scene, result):
     matches = replace(result.matches.keep(np.arange(4)), u_left=u, u_right=scene.rig.right.project(scene.truth(u)))
     assert np.isnan(rig.epipolar_distance(matches.u_left, matches.u_right)).tolist() == [False, False, True, False]
     assert epipolar_inliers(rig, matches).tolist() == [True, True, False, True]
+
+
+def test_points_without_neighbours_are_dropped():
+    x, y = (side.ravel() for side in np.mgrid[:12, :15] * 0.1)
+    points = np.column_stack([x, y, 0.3 * x])
+    points[[40, 100, 101], 2] += 3.0
+    assert np.flatnonzero(~in_company(points)).tolist() == [40, 100, 101]
+    assert in_company(points[:2]).all() and not len(in_company(points[:0]))
 
 
 @pytest.mark.parametrize(("black", "blur_px"), [(0, 0), (16, 0), (0, 6)])
