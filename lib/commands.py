@@ -22,6 +22,7 @@ from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences, of_recording
 from lib.importing import guess_mapping, import_recording
 from lib.landmarks import Detector, SharedDetector, detect
+from lib.matching import RigMisfitError
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
@@ -112,6 +113,7 @@ def main_reconstruct(argv: list[str]) -> int:
     rig, offsets, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
+    cause = next(iter(verdict.reasons), None)
     frame, now = recording.frames[a.frame], with_offsets(data, offsets).of_frames(a.frame)
     pair = rig.pair if isinstance(rig, Calibration) else rig
     tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
@@ -121,7 +123,11 @@ def main_reconstruct(argv: list[str]) -> int:
             text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
             cure = "Choose another frame, or label this one and give --landmarks annotations."
         verdict = Verdict.join([verdict, Verdict((Reason("tool_not_masked", LEVELS[1], text, cure),))])
-    found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
+    try:
+        found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
+    except RigMisfitError as error:
+        why = f" The recording's verdict says: {cause.text} {cause.cure}" if cause else ""
+        raise ValueError(f"{error}{why}") from None
     if found.matches.ambiguous > AMBIGUOUS:
         share = f"{100 * found.matches.ambiguous:.0f} % of the matches"
         text = f"The texture repeats: {share} fit several places, and were dropped."

@@ -17,6 +17,7 @@ from lib.calibration import LandmarkOffsets, calibrate, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
+from lib.matching import RigMisfitError
 from lib.recordings import Recording
 from lib.simulator import Design, Eye, Microscope, simulate
 from lib.surface import export
@@ -245,6 +246,17 @@ def test_reconstruct_without_open3d_writes_the_rest(out, tmp_path, monkeypatch, 
     found = {path.name for path in tmp_path.iterdir()}
     assert {"depth.tiff", "rectified_left.png", "refined_rig.json", "reconstruction.json"} <= found
     assert not {"surface.glb", "points.ply"} & found
+
+
+def test_reconstruct_names_the_cause_if_the_cameras_do_not_fit_the_images(out, tmp_path, monkeypatch):
+    def misfit(*_, **__):
+        raise RigMisfitError("rig: it does not fit the images.")
+
+    monkeypatch.setattr(commands, "reconstruct", misfit)
+    shutil.copy(out / "rig.json", tmp_path / "another.json")
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--frame", "2", "--out", str(tmp_path)]
+    with pytest.raises(ValueError, match=r"does not fit the images\. The recording's verdict says: .* nothing here shows .* Run: "):
+        commands.main_reconstruct([*argv, "--rig", str(tmp_path / "another.json")])
 
 
 def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):

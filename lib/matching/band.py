@@ -57,6 +57,10 @@ REACH = 2
 RIDGE = 0.05
 
 
+class RigMisfitError(ValueError):
+    """Most matches are far from the epipolar lines of the rig."""
+
+
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
 ) -> tuple[Rectification, float, tuple[float, float], float] | None:
@@ -82,7 +86,7 @@ def plan_search(
             what = f"the median distance of {len(displacement)} free matches from their epipolar lines is {misfit:.1f} px"
             cure = "Calibrate again, or check that left and right are not exchanged"
             allowed = f"{max_epipolar_px:.1f} px are allowed (max_epipolar_px)"
-            raise ValueError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
+            raise RigMisfitError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
         off_line_px = float(np.median(displacement[:, 1]))
         low, high = np.percentile(displacement[:, 0], (0.5, 99.5))
         margin = 4 / min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
