@@ -255,7 +255,8 @@ def test_reconstruct_names_the_cause_if_the_cameras_do_not_fit_the_images(out, t
     monkeypatch.setattr(commands, "reconstruct", misfit)
     shutil.copy(out / "rig.json", tmp_path / "another.json")
     argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--frame", "2", "--out", str(tmp_path)]
-    with pytest.raises(ValueError, match=r"does not fit the images\. The recording's verdict says: .* nothing here shows .* Run: "):
+    said = r"does not fit the images\. The recording's verdict says: .* nothing here shows .* Run: "
+    with pytest.raises(ValueError, match=said):
         commands.main_reconstruct([*argv, "--rig", str(tmp_path / "another.json")])
 
 
