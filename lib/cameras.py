@@ -323,7 +323,10 @@ class StereoRig:
         covariance_mm2 = np.linalg.inv(self.linear.T @ weight_A if self.sees_depth else np.full((1, 3, 3), np.nan))
         gain = covariance_mm2 @ weight_A.mT
         x = (gain[0] @ y).T if len(gain) == 1 else np.einsum("nij,jn->ni", gain, y)
-        return Points(x, np.broadcast_to(covariance_mm2, (len(x), 3, 3)), self.epipolar_normal @ y)
+        covariance_mm2 = np.broadcast_to(covariance_mm2, (len(x), 3, 3))
+        if (missing := np.isnan(x[:, 0])).any():
+            covariance_mm2 = np.where(missing[:, None, None], np.nan, covariance_mm2)
+        return Points(x, covariance_mm2, self.epipolar_normal @ y)
 
     def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray) -> Points:
         """A linear solution (the projection times its denominator), then two Gauss-Newton steps on the reprojection error."""

@@ -72,8 +72,8 @@ def pair_covariance(covariance_px2: ArrayLike | None, n: int, images: int = 2) -
     m = 2 * images
     given = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
     if given.ndim == 0:
-        if not given > 0:
-            raise ValueError(f"covariance_px2: a variance must be positive, got {given}.")
+        if not 0 < given < np.inf:
+            raise ValueError(f"covariance_px2: a variance must be positive and finite, got {given}.")
         covariance = given * np.eye(m)[None]
     elif given.shape == (2, 2):
         covariance = np.kron(np.eye(images), given)[None]
@@ -118,7 +118,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distances (n, m / 2) of residuals (n, m), for each view by its block of covariances (n, m, m)."""
-    r = residual.reshape(len(residual), -1, 2, 1)
+    r = residual.reshape(len(residual), residual.shape[1] // 2, 2, 1)
     own = np.stack([covariance[:, i : i + 2, i : i + 2] for i in range(0, residual.shape[1], 2)], axis=1)
     return (r.mT @ np.linalg.solve(own, r))[..., 0, 0]
 

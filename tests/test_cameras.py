@@ -159,7 +159,8 @@ def test_triangulation_keeps_missing_matches_missing(rig, near):
         u_left, u_right = (u.copy() for u in pair.project(x))
         u_right[2] = np.nan
         found = pair.triangulate(u_left, u_right)
-        assert np.isnan(found.x_mm[2]).all() and np.isnan(found.epipolar_px[2])
+        assert np.isnan(found.x_mm[2]).all() and np.isnan(found.epipolar_px[2]) and np.isnan(found.covariance_mm2[2]).all()
+        assert np.isfinite(np.delete(found.covariance_mm2, 2, 0)).all()
         np.testing.assert_allclose(np.delete(found.x_mm, 2, 0), np.delete(x, 2, 0), atol=1e-9)
 
 

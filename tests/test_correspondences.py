@@ -134,6 +134,19 @@ def test_wrong_shapes_are_named():
         Correspondences.of_points(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 2)), confidence=[1, 1])
 
 
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"frame": [0.0, 0.04]}, "frame: expected whole numbers.*time_s"),
+        ({"landmark": [0, -1]}, "landmark: must not be negative"),
+    ],
+)
+def test_frames_and_landmarks_are_numbers(change, text):
+    with pytest.raises(ValueError, match=text):
+        Correspondences.of_points(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 2)), **change)
+    assert Correspondences.of_points(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 2)), frame=[3.0, 4.0]).frame[1] == 4
+
+
 def test_one_frame_is_no_failure_of_the_detector():
     one = Correspondences.of_points(np.eye(3), np.ones((3, 2)), np.ones((3, 2)))
     with pytest.raises(ValueError, match=r"3 landmarks in all, .* Record more frames") as error:

@@ -95,7 +95,7 @@ INDEFINITE = np.eye(4) - 0.6 * (np.ones((4, 4)) - np.eye(4))
 
 
 @pytest.mark.parametrize(
-    "bad", [np.eye(3), np.ones((4, 4, 4)), -1.0, np.diag([1.0, 1, 1, -1]), np.zeros((5, 4, 4)), INDEFINITE]
+    "bad", [np.eye(3), np.ones((4, 4, 4)), -1.0, np.inf, np.diag([1.0, 1, 1, -1]), np.zeros((5, 4, 4)), INDEFINITE]
 )
 def test_pair_covariance_refuses_what_is_no_covariance(bad):
     with pytest.raises(ValueError, match="covariance_px2"):

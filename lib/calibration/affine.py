@@ -93,7 +93,7 @@ def estimate_noise(
     scoring maximises the likelihood of the residuals along the eigenvectors of A A^T, for the `views` (n, m / 2) bool of
     each row (None = all).  Single views have no epipolar direction: without pairs sigma_x is 0 unless one level is given.
     `parameters` is the number of fitted parameters.  A given level is kept.  `claimed_px2` (1 or n, m, m), a detector's
-    covariances, take the place of I: one factor of 1 or more scales them, and sigma_u is the RMS of the scaled ones.
+    covariances, take the place of I: one factor of 1 or more scales them, and sigma_u is their `noise_rms_px`.
     """
     n, m = residuals.shape
     code = np.full(n, 3) if views is None else views @ [1, 2][: m // 2]
@@ -138,5 +138,6 @@ def estimate_noise(
 
 
 def noise_rms_px(covariance_px2: np.ndarray) -> float:
-    """RMS standard deviation of a pixel coordinate over covariances (n, m, m)."""
-    return float(np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2).mean() / covariance_px2.shape[1]))
+    """RMS standard deviation of a pixel coordinate over covariances (n, m, m), each at most three times the median one."""
+    variance = np.trace(covariance_px2, axis1=1, axis2=2) / covariance_px2.shape[1]
+    return float(np.sqrt(np.minimum(variance, 9.0 * np.median(variance)).mean()))  # else one row may decide

@@ -29,8 +29,9 @@ _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
 _NARROW = 0.05  # quantile of the distance between the tips: offsets turn the axes most where the tips are close
 #: Turned axes are preferred unless their log likelihood is lower by more than this.
 _AS_LIKELY = 3.0
-#: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them); derivatives' step.
-_FINITE, _STEP_PER_MM = 3.0, 1e-6
+#: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them), or, if negative, as
+#: mirrored images (a curved field may exceed three); step of its derivative.
+_FINITE, _MIRRORED, _STEP_PER_MM = 3.0, 8.0, 1e-6
 
 
 @single_threaded_blas()
@@ -120,6 +121,8 @@ def calibrate(
         found = estimate(axes=axes)
         if axes is not None:
             found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
+    for rows in found.view_inliers.T if checks else ():  # again, with the noise of this robot
+        refuse.check_spread(found.x_mm[rows], found.sigma_x_mm)
     if usable is None:
         return found
     # Insert the rows that are not usable, so that the results have one entry for each row of the data.
@@ -137,7 +140,8 @@ def calibrate_as_shown(
     """`calibrate` with affine cameras, or with cameras at a finite distance if the detections show a significant one.
 
     It is significant if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
-    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.
+    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.  If
+    1/distance is negative by eight of them, a warning says that the images look mirrored.
 
     >>> from lib.simulator.rig import reference_rig
     >>> rng = np.random.default_rng(0)
@@ -153,6 +157,9 @@ def calibrate_as_shown(
         value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
         if value > _FINITE * sd:
             return calibrate(data, model=models[1], **options)
+        if value < -_MIRRORED * sd:
+            what = "farther things look larger, so the images look mirrored, and depths would have the wrong sign"
+            warnings.warn(f"u_left, u_right: {what}; flip both images, or use a right-handed robot frame.", stacklevel=2)
     return found
 
 
@@ -224,8 +231,10 @@ def _calibrate(
     if weighting not in ("likelihood", "paper"):
         raise ValueError(f"weighting: expected 'likelihood' or 'paper', got {weighting!r}.")
     for name, value in (*known.items(), ("ransac_px", ransac_px)):
-        if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
-            raise ValueError(f"{name}: must not be negative, and sigma_u_px not zero, got {value}; None estimates it.")
+        endless = value == np.inf and name != "ransac_px"
+        if value is not None and (endless or not (value > 0 or (value == 0 and name != "sigma_u_px"))):
+            rule = "must be finite and not negative, and sigma_u_px not zero (ransac_px may be infinite)"
+            raise ValueError(f"{name}: {rule}, got {value}; None estimates it.")
     if np.isfinite(y).sum() < len(plan.parameter_names):
         raise DataError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():

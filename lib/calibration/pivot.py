@@ -11,9 +11,12 @@ from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
+from lib.least_squares import minimise
 
 _TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of robot noise then give an sd of 0.5 mm / sqrt(poses)
 _OPENING = 0.03  # least range of half the opening (rad): it moves the end of a 3 mm jaw by 100 um
+_SHIFT_MM = 0.05  # least RMS distance of a tool that moves from one that only turns about a point: it gives the scale
+_NOISE_LEVELS = 4  # number of estimates of the noise levels
 _LARGEST_SD_MM = 1.0  # largest standard deviation of an offset's coordinate; above it the offset counts as undetermined
 
 
@@ -88,11 +91,9 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     """
     R, t = _poses(robot_from_tool)
     n = len(R)
-    design = np.concatenate([R, np.broadcast_to(-np.eye(3), (n, 3, 3))], axis=2).reshape(-1, 6)
-    solution = np.linalg.lstsq(design, -t.ravel(), rcond=None)[0]
-    r = design @ solution + t.ravel()
+    design, solution, r = _resting_point(R, t)
     covariance = float(r @ r) / max(3 * n - 6, 1) * np.linalg.inv(design.T @ design)
-    rms, spread = float(np.sqrt((r**2).sum() / n)), float(np.sqrt(((t - t.mean(axis=0)) ** 2).sum() / n))
+    rms, spread = float(np.sqrt(r @ r / n)), float(np.sqrt(((t - t.mean(axis=0)) ** 2).sum() / n))
     if rms > max(0.25 * spread, 0.05):
         raise ValueError(f"robot_from_tool: the tip did not rest ({rms:.2f} mm RMS): hold it in a divot or use tool_offsets.")
     _check_determined(covariance[:3, :3])
@@ -105,19 +106,24 @@ def tool_offsets(
 ) -> ToolOffsets:  # fmt: skip
     """Estimates landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + t.
 
-    Gauss-Newton on both, with an initial value from the relaxed problem that is linear in (A, A (x) p, t).  A landmark on a
-    jaw has p_k = offset + sin(o_i / 2) sine + (1 - cos(o_i / 2)) versine at the opening o_i; this is linear for any hinge.
+    Damped Gauss-Newton on both, with an initial value from the relaxed problem that is linear in (A, A (x) p, t).  A
+    landmark on a jaw has p_k = offset + sin(o_i / 2) sine + (1 - cos(o_i / 2)) versine at the opening o_i; this is linear
+    for any hinge.
 
     Args:
-        robot_from_tool: n poses; the tool must be turned about at least two axes.
+        robot_from_tool: n poses; the tool must be turned about at least two axes, and moved.
         u: One array a camera, (n, k, 2) px; NaN = missing.
         opening_rad: (n,) full angle between the jaws; None is a tool without a hinge.
         turning: (k,) not 0 for landmarks on a jaw; None is all but the first.
 
-    A ValueError refuses too few poses, and motion that does not determine the offsets or the hinge.  Outliers are not
-    removed: look at `rms_px`.
+    A ValueError refuses too few poses, a tool that only turns about one point, and motion that does not determine the offsets
+    or the hinge.  Outliers are not removed: look at `rms_px`.
     """
     R, t = _poses(robot_from_tool)
+    rests_mm = np.linalg.norm(_resting_point(R, t)[2]) / np.sqrt(len(R))
+    if rests_mm < _SHIFT_MM:
+        what = f"the tool only turns about one point (to {rests_mm:.2g} mm RMS), which leaves its size open"
+        raise ValueError(f"robot_from_tool: {what}; move it through the volume as well.")
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]
     if any(i.ndim != 3 or i.shape[0] != len(R) or i.shape[2] != 2 or i.shape != images[0].shape for i in images):
         raise ValueError(f"u: expected ({len(R)}, k, 2) pixels a camera, got {[i.shape for i in images]}.")
@@ -150,23 +156,32 @@ def tool_offsets(
     solution = np.linalg.lstsq(np.hstack([t / scale, np.ones((len(t), 1)), lifted]), pixels, rcond=1e-6)[0]
     A, B = solution[:3].T, solution[4:].reshape(q, 3, 3, -1)  # B: vector, row of R (with A), column (with p), pixel
     offset = np.einsum("kijm,mi->kj", B, A) / (A**2).sum() * scale
-    for _ in range(100):
+    def evaluate(offset: np.ndarray) -> tuple[float, tuple[np.ndarray, ...]]:
+        """Energy; points, cameras and residuals.  The weights are the same for all rows, so they change no camera."""
         x = np.einsum("nij,nj->ni", R, own @ offset) + t
         matrix = regress(x, pixels)
         r = pixels - x @ matrix[:, :3].T - matrix[:, 3]
-        # Variable projection (Kaufman): the cameras are linear, so they are eliminated from the offsets' derivatives.
+        return 0.5 * float(((r @ root.T) ** 2).sum()), (x, matrix, r)
+
+    def derivatives(x: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """(n, m, 3 q) by the vectors.  Variable projection (Kaufman): the cameras are linear, so they are eliminated."""
         J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * q)
         Q = np.linalg.qr(np.column_stack([x - x.mean(axis=0), np.ones(len(x))]))[0]
-        J -= np.tensordot(Q, np.tensordot(Q.T, J, axes=1), axes=1)
+        return J - np.tensordot(Q, np.tensordot(Q.T, J, axes=1), axes=1)
+
+    def normal_equations(_: np.ndarray, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        flat = (root @ derivatives(*work[:2])).reshape(-1, 3 * q)
+        return flat.T @ flat, flat.T @ (work[2] @ root.T).ravel()
+
+    root = np.eye(m)  # whitens the noise, which is estimated after each minimum
+    for _ in range(_NOISE_LEVELS):
+        found = minimise(offset, evaluate, normal_equations, lambda offset, step: offset + step.reshape(q, 3))
+        offset, (x, matrix, r) = found.state, found.work
         sigma_u, sigma_x = estimate_noise(r, matrix[:, :3], 4 * m + 3 * q)
         noise_px2 = max(sigma_u, 1e-9) ** 2 * np.eye(m) + sigma_x**2 * matrix[:, :3] @ matrix[:, :3].T
-        root = np.linalg.inv(np.linalg.cholesky(noise_px2))  # the same for all rows, so it changes no camera
-        flat = (root @ J).reshape(-1, 3 * q)
-        step = np.linalg.lstsq(flat, (r @ root.T).ravel(), rcond=None)[0]
-        offset = offset + step.reshape(q, 3)
-        if np.abs(step).max() < 1e-9 * scale:
-            break
-    information = flat.T @ flat
+        root = np.linalg.inv(np.linalg.cholesky(noise_px2))
+    J = derivatives(x, matrix)
+    information = normal_equations(offset, found.work)[0]
     if np.linalg.cond(information) > 1e13:
         raise ValueError("robot_from_tool: the motion does not determine the offsets; turn the tool about two axes.")
     both, weight = np.concatenate([J, camera_columns(x - x.mean(axis=0), m)], axis=2), np.linalg.inv(noise_px2)[None]
@@ -189,6 +204,13 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
     if np.linalg.svd((R - R.mean(axis=0)).reshape(-1, 3), compute_uv=False)[2] < _TURN * np.sqrt(len(R)):
         raise ValueError("robot_from_tool: the tool hardly turns, or about only one axis; rotate it about two axes.")
     return R, t
+
+
+def _resting_point(R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least-squares solution (p, c) of R_i p + t_i = c: its design matrix (3 n, 6), (p, c) and the residuals (3 n,)."""
+    design = np.concatenate([R, np.broadcast_to(-np.eye(3), (len(R), 3, 3))], axis=2).reshape(-1, 6)
+    solution = np.linalg.lstsq(design, -t.ravel(), rcond=None)[0]
+    return design, solution, design @ solution + t.ravel()
 
 
 def _check_determined(covariance_mm2: np.ndarray) -> None:

@@ -49,6 +49,8 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
     [33.3, 66.7, 100.0]
     """
     length = tool_length_px(u_true) if length_px is None else np.asarray(length_px, dtype=np.float64)
+    if length.shape != (len(u),):
+        raise ValueError(f"length_px: expected ({len(u)},), one length a frame, got {length.shape}.")
     relative = errors_px(u, u_true) / np.where(length > 0, length, np.nan)[:, None]
     relative = np.sort(relative[~np.isnan(relative)])
     if not relative.size:

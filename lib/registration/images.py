@@ -5,6 +5,7 @@ every pixel is weighted by its own noise, and landmarks that only one camera see
 cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
 """
 
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,6 +24,7 @@ from lib.registration.rigid import Registration, check_spread, motion_jacobian, 
 _FREEDOM = 4.0  # degrees of freedom of Student's t for "robust": gross errors lose their weight, small ones keep it
 _STATED_ROWS = 20  # number of rows that the stated noise counts for, against the residuals' scatter, in the covariance
 _OUTLIER = 16.0  # chi-square of the two coordinates in an image above which it is an outlier (1 in 3,000 by chance)
+_UNSURE_RAD = np.deg2rad(5.0)  # standard deviation of a rotation above which `register_images` warns
 _UNDETERMINED = 1e-12  # relative curvature below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
@@ -44,7 +46,9 @@ def register_images(
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
         loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
 
-    A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.
+    A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.  A warning says that
+    a rotation is uncertain by more than 5 degrees (standard deviation), as in a single frame with shut jaws: then it may be
+    wrong by far more than its covariance states.
 
     >>> from lib.cameras import AffineCamera
     >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
@@ -52,7 +56,12 @@ def register_images(
     >>> register_images(rig, x + [0.2, 0.1, 0.5], *rig.project(x)).transform.t.round(6).tolist()
     [0.2, 0.1, 0.5]
     """
-    return _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
+    found = _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
+    sd_rad = np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])
+    if sd_rad > _UNSURE_RAD:
+        what = f"the rotation about an axis has a standard deviation of {np.rad2deg(sd_rad):.0f} degrees, so it may be wrong"
+        warnings.warn(f"x_mm: {what}; use more frames, or frames with open jaws.", stacklevel=2)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +138,16 @@ class _Observed:
     @classmethod
     def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> Self:
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
-        if not sigma_x_mm >= 0:
-            raise ValueError(f"sigma_x_mm: must not be negative, got {sigma_x_mm}.")
+        if not 0 <= sigma_x_mm < np.inf:
+            raise ValueError(f"sigma_x_mm: must be finite and not negative, got {sigma_x_mm}.")
         seen = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         check_spread(data.x_mm[seen.any(axis=1)], "x_mm (rows with a detection)")
         if covariance_px2 is None and np.isfinite(data.covariance_px2[seen]).all():
             covariance_px2 = np.where(np.isfinite(data.covariance_px2), data.covariance_px2, np.eye(2))
         covariance = pair_covariance(covariance_px2, len(data)) + sigma_x_mm**2 * rig.linear @ rig.linear.T
+        used = np.repeat(seen, 2, axis=1)
+        if not np.isfinite(np.where(used[:, :, None] & used[:, None], covariance, 0.0)).all():
+            raise ValueError("covariance_px2: must be finite where an image shows a landmark; drop rows of unknown noise.")
         # Rows and images that are not used get no information; their values only have to be finite.
         x = np.where(seen.any(axis=1, keepdims=True), data.x_mm, data.x_mm[seen.any(axis=1)].mean(axis=0))
         return cls(x, np.nan_to_num(data.stacked_px), covariance, seen, covariance_px2 is not None)
@@ -230,13 +242,15 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     if np.linalg.matrix_rank(information, tol=_UNDETERMINED * np.trace(information), hermitian=True) < parameters:
         cure = "Add frames in other positions." if data.seen.any(axis=0).all() else "Both cameras must see the tool."
         raise ValueError(f"x_mm, u_left, u_right: these landmarks do not determine the motion. {cure}")
-    covariance = np.linalg.pinv(information, rcond=_UNDETERMINED, hermitian=True)
+    # A row tells at most what its noise allows, but the robust weights of small residuals exceed 1.
+    rows, gradient = gradients(found.state, found.work)
+    stated = (rows / np.maximum(weights, 1.0)[:, None, None]).sum(axis=0)
+    covariance = np.linalg.pinv(stated, rcond=_UNDETERMINED, hermitian=True)
     n, size = used.sum(), data.dimension.sum()
     own = covariance * distance2.sum() / max(size - parameters, 1)
     if loss == "robust":
         # The weights fall as a residual grows, so the Hessian is smaller than the weighted information.  If nothing fits,
         # the Hessian may be indefinite; then use the information.
-        _, gradient = gradients(found.state, found.work)
         hessian = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         indefinite = np.linalg.eigvalsh(hessian)[-parameters] <= _UNDETERMINED * np.trace(information)
         own = sandwich(information if indefinite else hessian, gradient[used], parameters * n / size)

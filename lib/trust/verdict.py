@@ -68,7 +68,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
 #: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
-_NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
+_NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 _BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
@@ -250,10 +250,11 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     if c.rig is None:
         return
     ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))
-    yield "zoom_ratio", ratio, f"One camera's zoom is {ratio:.2f} times the other's.", cure, name
+    unless = f"{cure} If the cameras are built so, nothing is wrong."
+    yield "zoom_ratio", ratio, f"One camera's zoom is {ratio:.2f} times the other's.", unless, name
     angle = np.rad2deg(c.rig.convergence_rad)
     text = f"The cameras converge by {min(angle, 180 - angle):.1f} degrees; a stereo microscope's by 2 to 20."
-    yield "convergence_high", min(angle, 180 - angle), text, cure, name
+    yield "convergence_high", min(angle, 180 - angle), text, unless, name
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
     mirrored, roll = optics(c).mirrored, np.rad2deg(optics(c).roll_rad)

@@ -145,16 +145,11 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
         names = [rung.model for rung in comparison.rungs]
         delta = [rung.bic - comparison.best.bic for rung in comparison.rungs]
         colours = [COLOURS["ours"] if rung is comparison.best else COLOURS["baseline"] for rung in comparison.rungs]
-        ax.barh(names, np.array(delta) + 1, color=colours)
-        for i, rung in enumerate(comparison.rungs):
-            ax.text(
-                delta[i] + 1.3,
-                i,
-                f"{delta[i]:.0f}" if rung is not comparison.best else "chosen",
-                va="center",
-                fontsize=8,
-            )
-        ax.set(xscale="log", xlim=(1, 5 * (most + 1)), xlabel="BIC above the best + 1", title=title)
+        bars = ax.barh(names, delta, color=colours)
+        labels = ["chosen" if above == 0 else f"{above:.0f}" for above in delta]
+        ax.bar_label(bars, labels, padding=3, fontsize=8)
+        ax.set(xscale="symlog", xlim=(0, 5 * (most + 1)), xlabel="BIC minus that of the best model", title=title)
+        ax.xaxis.set_major_formatter("{x:g}")
     axes[0, 0].invert_yaxis()  # shared
     return page
 

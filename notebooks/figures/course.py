@@ -25,6 +25,13 @@ def agree(what: str, here: ArrayLike, library: ArrayLike, *, within: float, unit
     print(line)
 
 
+def is_paper(profile: str) -> bool:
+    """True for the profile "paper", False for "quick"; a ValueError names any other."""
+    if profile not in ("quick", "paper"):
+        raise ValueError(f'profile = {profile!r}: give "quick" or "paper".')
+    return profile == "paper"
+
+
 def in_range(**given: tuple[float, float, float]) -> None:
     """Check parameters before anything is computed: name=(value, least, most).  Raises ValueError outside of [least, most].
 

@@ -16,6 +16,7 @@ from matplotlib.colors import LightSource, LogNorm, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator
+from scipy.ndimage import label
 from scipy.spatial import KDTree
 
 from lib.cameras import StereoRig
@@ -119,11 +120,18 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
         # Subtract the median: the background of a correlation map is high, and the peak matters.
         shown = np.clip((level.response - np.median(level.response)) / np.ptp(level.response), 0, 1)
         bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="magma_r", norm=PowerNorm(0.8))
-        rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
+        regions, share = _high(level.response)
         bottom.plot(*level.peak_px, "o", mfc="none", mec=COLOURS["ours"], markersize=13, markeredgewidth=2)
-        bottom.set_title(f"{rivals} of {level.response.size} places\nabove 80 % of the peak", fontsize=9)
+        bottom.set_title(f"{regions} regions, {100 * share:.2g} % of the places,\nabove 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
     return page
+
+
+def _high(response: np.ndarray) -> tuple[int, float]:
+    """Number of separate regions of a response map above 80 % of its peak, and their share of its places."""
+    high = response > 0.8 * response.max()
+    _, regions = label(high, structure=np.ones((3, 3)))
+    return regions, float(high.mean())
 
 
 def neighbourhood(left: np.ndarray, right: np.ndarray, alone: ResponseMap, judged: ResponseMap) -> Figure:
@@ -347,7 +355,10 @@ def score_table(
 
 
 def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
-    """Maps (h, w) of errors over the image, NaN where unknown, on the same colour scale."""
+    """Maps (h, w) of errors over the image, NaN where unknown, on the same colour scale.
+
+    The scale ends at `limit_um`; None = at the 98th percentile of all errors.  The colour bar states its end.
+    """
     if limit_um is None:
         limit_um = float(np.nanpercentile(np.abs(np.concatenate([m.ravel() for m in maps_um.values()])), 98))
     page, axes = figure(1, len(maps_um), width_in=4.6 * len(maps_um), height_in=2.9, squeeze=False)
@@ -356,7 +367,8 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
         show_image(ax, values, f"{name}: {rms:.1f} um RMS")
         ax.images[0].set(cmap=_SIGNED if signed else _ERROR, clim=(-limit_um if signed else 0, limit_um))
         ax.set_facecolor("#dddddd")
-    page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label="depth error (um)" if signed else "um", shrink=0.85)
+    ends = f"depth error (um), colours end at ±{limit_um:.2g}" if signed else f"error (um), colours end at {limit_um:.2g}"
+    page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label=ends, extend="both" if signed else "max", shrink=0.85)
     return page
 
 
@@ -690,8 +702,8 @@ def growing(responses: Mapping[str, np.ndarray]) -> Figure:
     """Response maps of one patch at growing sizes, each divided by its peak."""
     page, axes = figure(1, len(responses), width_in=3.6 * len(responses), height_in=2.9)
     for ax, (name, response) in zip(axes, responses.items(), strict=True):
-        high = int((response > 0.8 * response.max()).sum())
-        show_image(ax, response / response.max(), f"{name}: {high} places above 80 %")
+        regions, _ = _high(response)
+        show_image(ax, response / response.max(), f"{name}: {regions} regions above 80 %")
         ax.images[0].set(cmap="magma_r", clim=(0, 1), interpolation="nearest")
         row, column = np.unravel_index(response.argmax(), response.shape)
         ax.plot(column, row, "o", mfc="none", mec=COLOURS["ours"], markersize=13, markeredgewidth=2)

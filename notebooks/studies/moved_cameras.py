@@ -5,6 +5,7 @@ Notebooks 00, 05 and 06 and the study of registration share it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -231,11 +232,12 @@ def _no_errors(estimators: Mapping[str, Estimator], n_frames: Sequence[int], tri
 
 
 def _estimate(errors, at, estimators, rig, data, motion, centre_mm) -> None:
-    for name, estimator in estimators.items():
-        try:
-            found = estimator(rig, data)
-        except ValueError:
-            continue  # too few landmarks in these frames: the errors stay NaN
+    try:
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # one frame may be too few: the errors tell
+            motions = {name: estimator(rig, data) for name, estimator in estimators.items()}
+    except ValueError:
+        return  # too few landmarks for one of them: the errors of all stay NaN, which compares them on the same frames
+    for name, found in motions.items():
         errors[name].translation_mm[at], errors[name].euler_rad[at] = motion_error(found.transform, motion, centre_mm)
         (stated,) = found.covariance_at(found.transform.inverse().apply(centre_mm[None]))
         errors[name].stated_mm[at] = np.sqrt(np.trace(stated))

@@ -1,5 +1,7 @@
 """Estimators: exact recovery, the minimum itself, noise levels, outliers, covariances, clear errors."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -459,6 +461,7 @@ def test_bad_data_are_refused_with_the_reason(spoil, message):
         ({"sigma_u_px": -1.0}, "sigma_u_px"),
         ({"sigma_u_px": 0.0}, "sigma_u_px"),
         ({"sigma_x_mm": np.nan}, "sigma_x_mm"),
+        ({"sigma_x_mm": np.inf}, "sigma_x_mm: must be finite"),
         ({"ransac_px": -3.0}, "ransac_px"),
         ({"covariance_px2": np.eye(3)}, "covariance_px2"),
         ({"covariance_px2": -np.eye(4)}, "positive definite"),
@@ -497,6 +500,15 @@ def test_a_mirrored_axis_that_looks_like_swapped_eyes_is_named_beside_them():
         calibrate(x * [1, -1, 1], u)
 
 
+def test_one_very_uncertain_row_does_not_hide_swapped_cameras():
+    x, u = good()
+    covariance_px2 = np.tile(np.eye(4), (len(x), 1, 1))
+    covariance_px2[5] *= 1e6
+    with pytest.raises(ValueError, match="swapped"):
+        calibrate(x, u[::-1], covariance_px2=covariance_px2)
+    assert calibrate(x, u, covariance_px2=covariance_px2).sigma_u_px < 3
+
+
 def test_a_head_whose_geometry_leaves_doubt_is_not_called_swapped():
     x, (u_left, u_right) = good()
     calibrate(x, [u_right, np.column_stack([1919 - u_left[:, 0], u_left[:, 1]])])  # one channel mirrored
@@ -514,14 +526,15 @@ def test_dlt_refuses_what_it_cannot_solve():
 
 
 def test_cameras_have_a_finite_distance_only_where_the_detections_show_one():
-    """Mirrored ones, and few rows, stay affine."""
+    """Mirrored ones, and few rows, stay affine.  A warning names the mirrored ones."""
     rng = np.random.default_rng(3)
     x = ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-4, 4, (60, 3)))
     for distance_mm, rows in ((np.inf, 60), (-190, 60), (190, 4), (190, 60)):
         u = [v + rng.normal(0, 1, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / distance_mm).project(x)]
         data = Correspondences.of_points(x, *u).subset(slice(rows))
         model = "near_affine" if (distance_mm, rows) == (190, 60) else "zero_skew"
-        assert calibrate_as_shown(data, ransac_px=np.inf).model == model
+        with pytest.warns(match="look mirrored.*flip both images") if distance_mm < 0 else nullcontext():
+            assert calibrate_as_shown(data, ransac_px=np.inf).model == model
     square = calibrate_as_shown(data, models=("square", "square+distance"))
     value, sd = square.inverse_distance_per_mm
     assert square.model == "square+distance" and abs(value - 1 / 190) < 3 * sd

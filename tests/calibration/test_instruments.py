@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from lib.calibration import (
     OnlineCalibration,
+    Tool,
     calibrate,
     estimate_time_offset,
     pivot_calibration,
@@ -153,6 +154,8 @@ def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
 
 def test_time_offset_at_the_edge_of_its_search_is_refused_with_the_cure():
     frames, robot = video(0.5, 0)
+    with pytest.raises(ValueError, match="search_s: half the width of the search must be positive"):
+        estimate_time_offset(frames, robot, search_s=-1)
     with pytest.raises(ValueError, match="^search_s: the search ends at its upper edge; widen search_s.$"):
         estimate_time_offset(frames, robot)
     assert estimate_time_offset(frames, robot, search_s=0.7).offset_s == pytest.approx(0.5, abs=1e-3)
@@ -273,6 +276,7 @@ def test_online_drops_gaps_and_gross_errors():
         u_right[1] += 300 * (i % 10 == 0)
         used = online.add(Correspondences.of_points(c.x_mm[rows], u_left, u_right))
         assert used.tolist() == [[False, True], [True, i % 10 > 0], [True, True]]
+    assert online.add(c.subset(slice(0))).shape == (0, 2)
     assert np.abs(online.solve().left.project(c.true_x_mm) - c.true_rig.left.project(c.true_x_mm)).max() < 2.0
 
 
@@ -320,6 +324,18 @@ def test_the_covariance_of_tool_offsets_holds_the_noise_of_the_poses():
     assert 0.6 < np.mean(distances) < 1.6  # 6 if the errors of the poses are taken for independent errors of pixels
 
 
+def test_tool_offsets_of_a_hinged_tool_and_a_robot_that_errs_by_100_um():
+    """The first step overshoots: without damping the search ended where the offsets seem undetermined."""
+    rng = np.random.default_rng(9)
+    hinge = Tool.hinged(np.tile([0.0, 0, 12], (3, 1)), [0, 1, -1], [0, 0, 12], [1, 0, 0], [0, 0, 3])
+    tool, opening = poses(30, 9, 0.4), rng.uniform(0.2, 0.8, 30)
+    x = hinge.positions_mm(tool, opening)
+    u = [rng.normal([c.project(row) for row in x], 1.0) for c in (reference_rig().left, reference_rig().right)]
+    reported = [RigidTransform(p.R, p.t + rng.normal(0, 0.1, 3)) for p in tool]
+    found = tool_offsets(reported, u, opening_rad=opening)
+    assert np.abs(found.positions_mm(tool, opening) - x).max() < 0.3
+
+
 def test_tool_offsets_name_what_is_wrong():
     tool = poses(30, 0)
     u = [np.stack([c.project(p.apply(OFFSETS)) for p in tool]) for c in (reference_rig().left, reference_rig().right)]
@@ -331,6 +347,8 @@ def test_tool_offsets_name_what_is_wrong():
         tool_offsets(tool, u, turning=[0, 1])
     with pytest.raises(ValueError, match="landmark 1 is in no frame"):
         tool_offsets(tool, [np.where(np.arange(3)[:, None] == 1, np.nan, p) for p in u])
+    with pytest.raises(ValueError, match="turns about one point .* move it through the volume as well"):
+        tool_offsets([RigidTransform(p.R, np.zeros(3)) for p in tool], u)
 
 
 def test_pivot_calibration():

@@ -16,6 +16,8 @@ def test_a_tool_without_length_does_not_count():
     for off in (0.0, 3.0):
         assert metrics.pck(labels + [off, 0.0], labels, 0.05) == 100.0
     assert np.isnan(metrics.pck(labels, labels, 0.05, length_px=[-5.0, 0.0]))
+    with pytest.raises(ValueError, match=r"length_px: expected \(2,\)"):
+        metrics.pck(labels, labels, 0.05, length_px=100.0)
 
 
 def test_pck_is_normalised_by_the_mean_base_to_tip_distance():

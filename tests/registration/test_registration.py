@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -207,6 +208,16 @@ def test_covariances_hold():
     assert 3.0 < mean["norm"] < 10.0
 
 
+def test_robust_covariances_of_few_rows_hold():
+    """The robust weights of the small residuals of few rows exceed 1; they are no information."""
+    scores = []
+    for seed in range(50):
+        motion, *data = scene(seed, 2)
+        fit = register_images(RIG, *data, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM, loss="robust")
+        scores.append(mahalanobis2(fit, motion))
+    assert 4.6 < np.mean(scores) < 7.4
+
+
 def test_covariance_at_grows_with_distance():
     _, *data = scene(1)
     fit = register_images(RIG, *data)
@@ -214,6 +225,20 @@ def test_covariance_at_grows_with_distance():
     np.testing.assert_allclose(near, fit.covariance[3:, 3:], rtol=1e-9)
     assert np.trace(far) > 2 * np.trace(near)
     np.testing.assert_allclose(fit.translation_sd_mm, np.sqrt(np.diag(near)))
+
+
+@pytest.mark.parametrize("loss", ["squared", "robust"])
+def test_one_frame_with_shut_jaws_does_not_show_the_rotation(loss):
+    """It may be wrong by tens of degrees, since the three landmarks lie nearly on a line: a warning says so."""
+    noise = {"covariance_px2": SIGMA_PX**2, "sigma_x_mm": SIGMA_MM, "loss": loss}
+    shut, opened = (
+        tool_frames(1, rng=np.random.default_rng(3), rig=RIG, opening_rad=(rad, rad), sigma_u_px=SIGMA_PX)
+        for rad in (0.005, 0.5)
+    )
+    with pytest.warns(UserWarning, match="x_mm: the rotation about an axis .* use more frames, or frames with open jaws"):
+        register_images(RIG, shut, **noise)
+    with warnings.catch_warnings(action="error"):
+        register_images(RIG, opened, **noise)
 
 
 def test_one_image_of_a_landmark_still_counts():
@@ -269,8 +294,15 @@ def test_bad_noise():
     data = scene(0)[1:]
     with pytest.raises(ValueError, match="covariance_px2"):
         register_images(RIG, *data, covariance_px2=np.eye(3))
-    with pytest.raises(ValueError, match="sigma_x_mm"):
-        register_images(RIG, *data, sigma_x_mm=-1)
+    for sigma_x_mm in (-1, np.inf):
+        with pytest.raises(ValueError, match="sigma_x_mm"):
+            register_images(RIG, *data, sigma_x_mm=sigma_x_mm)
+    unknown = np.tile(np.eye(4), (len(data[0]), 1, 1))
+    unknown[2, :2, :2] = np.nan
+    with pytest.raises(ValueError, match="covariance_px2: must be finite where an image shows a landmark"):
+        register_images(RIG, *data, covariance_px2=unknown)
+    data[1][2] = np.nan  # not seen: its noise does not matter
+    assert np.isfinite(register_images(RIG, *data, covariance_px2=unknown).covariance).all()
 
 
 # --- cameras that move apart -----------------------------------------------------------------------------------------

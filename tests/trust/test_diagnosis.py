@@ -294,6 +294,11 @@ def test_jaws_of_a_constant_opening_accuse_nobody(options):
     assert found(take(seed=1, frames=90, opening_mm=(1.0, 1.0001), **options)).best is None
 
 
+def test_an_opening_that_hardly_changes_is_not_accused_where_offsets_cancel_it():
+    options = {"frames": 15, "fps": 2.5, "opening_mm": (0.22, 0.42), "noise_px": 1.5, "bias_mm": 0.05, "memory": 0.9}
+    assert found(take(seed=17, **options)).best is None
+
+
 def test_exchanged_tips_of_a_constant_opening_are_no_offsets():
     assert found(take("tips exchanged", "both images", opening_mm=(1.0, 1.0001))).best.name == "tip_order"
 
