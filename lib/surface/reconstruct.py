@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from lib.calibration import Calibration
 from lib.cameras import AffineCamera, Points, StereoRig
 from lib.matching import Matches, checked_mask, dark_mask, glint_mask, match, tool_mask
-from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface
+from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface, sign_inflation
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
@@ -23,6 +23,8 @@ _BENDING = 100
 AMBIGUOUS = 0.25
 #: Points whose third nearest neighbour is this many times as far as usual are dropped.
 _ALONE = 6.0
+#: Width, in cells of the surface, of the squares in which errors of matches are taken as shared: a spline follows them there.
+_SHARED_CELLS = 2.0
 #: For `refine_rig`: number of correlated matches that count as one; standard deviations above which residuals lose weight.
 _CORRELATED, _SOFT = 10.0, 2.0
 
@@ -66,6 +68,11 @@ def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
     An error of the calibration shifts, turns and bends all epipolar lines by up to some pixels.  So a robust quadratic
     function of the left image point is subtracted from the distances first.  Matches that no point explains are dropped.
     """
+    return np.abs(_off_lines(rig, matches)) < EPIPOLAR_SIGMAS * matches.sigma_along(rig.epipolar_normal)
+
+
+def _off_lines(rig: StereoRig, matches: Matches) -> np.ndarray:
+    """Distances (n,) px of the matches from the epipolar lines, less what is common to them; NaN if no point explains it."""
     distance, sigma = rig.epipolar_distance(matches.u_left, matches.u_right), matches.sigma_along(rig.epipolar_normal)
     known = np.isfinite(distance)
     common = np.median(distance[known]) if known.any() else 0.0
@@ -74,7 +81,7 @@ def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
         bend = np.column_stack([x * x, x * y, y * y, x, y])
         found, _ = _regression(bend[known], distance[known] - common, sigma[known])
         common = common + bend @ found[:-1] + found[-1]
-    return np.abs(distance - common) < EPIPOLAR_SIGMAS * sigma
+    return distance - common
 
 
 def in_company(x_mm: np.ndarray) -> np.ndarray:
@@ -209,6 +216,11 @@ def reconstruct(
         depth_only = fast and rig.is_affine if depth_only is None else depth_only
         how = {"control": control, "smoothness": smoothness, "camera": rig.left if depth_only else None, "quick": fast}
         surface = fit_surface(matches.u_left, points.x_mm, domain=domain, **how)
+        # Along the lines the surface follows errors that neighbours share.  Across them no surface hides these errors.
+        kept = surface.inliers
+        off = _off_lines(rig, matches)[kept, None]
+        inflation = float(sign_inflation(surface.grid, matches.u_left[kept], off, _SHARED_CELLS)[0])
+        surface = replace(surface, fit=replace(surface.fit, inflation=inflation))
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 
 

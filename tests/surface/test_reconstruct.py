@@ -20,6 +20,7 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.render import render_pair
 from lib.simulator.rig import Microscope
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
+from lib.surface.bspline import sign_inflation
 from lib.surface.reconstruct import in_company
 from lib.workbench import results
 from notebooks import real_data
@@ -110,6 +111,19 @@ def test_a_match_that_no_point_explains_is_dropped_alone(scene, result):
     matches = replace(result.matches.keep(np.arange(4)), u_left=u, u_right=scene.rig.right.project(scene.truth(u)))
     assert np.isnan(rig.epipolar_distance(matches.u_left, matches.u_right)).tolist() == [False, False, True, False]
     assert epipolar_inliers(rig, matches).tolist() == [True, True, False, True]
+
+
+def test_errors_that_neighbours_share_inflate_the_covariance(scene, result):
+    """The surface follows them, so only the distances from the epipolar lines show them."""
+    rng, grid = np.random.default_rng(0), SplineGrid((0, 0, 100, 100), (13, 13))
+    u = rng.uniform(0, 100, (4000, 2))
+    alone, shared = rng.normal(size=(4000, 1)), rng.normal(size=(5, 5))[tuple((u // 20).astype(int).T)][:, None]
+    assert sign_inflation(grid, u, alone, 2) < 1.3
+    assert sign_inflation(grid, u, alone + shared, 2) > 20
+    fit = result.surface.fit
+    twice = replace(result.surface, fit=replace(fit, inflation=4 * max(fit.agreement[0].max(), fit.inflation)))
+    ratio = twice.covariance([[320, 180]]) / result.surface.covariance([[320, 180]])
+    assert 1 <= fit.inflation < 8 and (np.diag(ratio[0]) > 3.9).all()
 
 
 def test_points_without_neighbours_are_dropped():
