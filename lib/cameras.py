@@ -219,6 +219,10 @@ class Points:
     covariance_mm2: np.ndarray
     epipolar_px: np.ndarray
 
+    def keep(self, chosen: np.ndarray) -> Self:
+        """The points of a mask (n,) or of indices."""
+        return Points(self.x_mm[chosen], self.covariance_mm2[chosen], self.epipolar_px[chosen])
+
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:

@@ -22,10 +22,12 @@ from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences, of_recording
 from lib.importing import guess_mapping, import_recording
 from lib.landmarks import Detector, SharedDetector, detect
+from lib.matching import RigMisfitError
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
 from lib.surface import Reconstruction, depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
+from lib.surface.reconstruct import AMBIGUOUS
 from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
 #: Least number of landmarks for comparing a rig with cameras calibrated from them (fewer are overfitted), and least error.
@@ -111,6 +113,7 @@ def main_reconstruct(argv: list[str]) -> int:
     rig, offsets, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
+    cause = next(iter(verdict.reasons), None)
     frame, now = recording.frames[a.frame], with_offsets(data, offsets).of_frames(a.frame)
     pair = rig.pair if isinstance(rig, Calibration) else rig
     tool = now.tool_px(pair) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
@@ -120,7 +123,16 @@ def main_reconstruct(argv: list[str]) -> int:
             text = f"The surface may include the tool, since base and tips are not all known in frame {a.frame}."
             cure = "Choose another frame, or label this one and give --landmarks annotations."
         verdict = Verdict.join([verdict, Verdict((Reason("tool_not_masked", LEVELS[1], text, cure),))])
-    found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
+    try:
+        found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
+    except RigMisfitError as error:
+        why = f" The recording's verdict says: {cause.text} {cause.cure}" if cause else ""
+        raise ValueError(f"{error}{why}") from None
+    if found.matches.ambiguous > AMBIGUOUS:
+        share = f"{100 * found.matches.ambiguous:.0f} % of the matches"
+        text = f"The texture repeats: {share} fit several places, and were dropped."
+        cure = "Others may be wrong, too: compare the surface with the images, or show a texture that does not repeat."
+        verdict = Verdict.join([verdict, Verdict((Reason("ambiguous_texture", LEVELS[1], text, cure),))])
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
     try:
         save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
@@ -137,7 +149,7 @@ def main_reconstruct(argv: list[str]) -> int:
     hint = " These are few: --setting fast may be more accurate, as in smooth images." if few else ""
     hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."
     print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches. {hidden}{hint}")
-    numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches}
+    numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches, "ambiguous": found.matches.ambiguous}
     return _done(a, out, "reconstruction", numbers, verdict)
 
 

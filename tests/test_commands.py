@@ -17,6 +17,7 @@ from lib.calibration import LandmarkOffsets, calibrate, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
+from lib.matching import RigMisfitError
 from lib.recordings import Recording
 from lib.simulator import Design, Eye, Microscope, simulate
 from lib.surface import export
@@ -201,10 +202,12 @@ def test_a_tool_without_labels_is_masked_where_the_robot_reports_it(out, tmp_pat
     assert np.abs(tools_px[0] - [recording.truth.u_left[2], recording.truth.u_right[2]]).max() < 10
     rows.x_mm[rows.frame == 2] = np.nan  # the robot does not know either
     monkeypatch.setattr(commands, "_FEW", 1.0)
+    monkeypatch.setattr(commands, "AMBIGUOUS", -1.0)
     assert commands.main_reconstruct(argv) == 0
     said = capsys.readouterr().out
     assert "The surface may include the tool" in said and "--setting fast may be more accurate" in said
-    assert "tool_not_masked" in (tmp_path / "reconstruction.json").read_text()
+    named = {reason["name"] for reason in json.loads((tmp_path / "reconstruction.json").read_text())["reasons"]}
+    assert {"tool_not_masked", "ambiguous_texture"} <= named
 
 
 def test_a_rig_has_the_verdict_of_the_recording_that_it_is_of(out, tmp_path, capsys):
@@ -243,6 +246,18 @@ def test_reconstruct_without_open3d_writes_the_rest(out, tmp_path, monkeypatch, 
     found = {path.name for path in tmp_path.iterdir()}
     assert {"depth.tiff", "rectified_left.png", "refined_rig.json", "reconstruction.json"} <= found
     assert not {"surface.glb", "points.ply"} & found
+
+
+def test_reconstruct_names_the_cause_if_the_cameras_do_not_fit_the_images(out, tmp_path, monkeypatch):
+    def misfit(*_, **__):
+        raise RigMisfitError("rig: it does not fit the images.")
+
+    monkeypatch.setattr(commands, "reconstruct", misfit)
+    shutil.copy(out / "rig.json", tmp_path / "another.json")
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--frame", "2", "--out", str(tmp_path)]
+    said = r"does not fit the images\. The recording's verdict says: .* nothing here shows .* Run: "
+    with pytest.raises(ValueError, match=said):
+        commands.main_reconstruct([*argv, "--rig", str(tmp_path / "another.json")])
 
 
 def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):

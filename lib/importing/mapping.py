@@ -38,6 +38,8 @@ class Video(_Section):
     right: str = ""
     file: str = ""
     exchanged: bool = False
+    rotate_left: Literal[0, 90, 180, 270] = 0  # degrees clockwise, after the exchange
+    rotate_right: Literal[0, 90, 180, 270] = 0
     times: Literal["container", "names", "table", "fps"] = "container"
     table: Table | None = None
     name_unit: Literal["s", "ms", "us", "ns"] = "ns"
@@ -152,6 +154,8 @@ class Mapping(_Section):
     def model_post_init(self, _: object) -> None:
         ours, columns = set(self.landmarks), self.robot.landmarks
         labels = self.labels.names if self.labels else {}
+        if self.labels and (self.video.rotate_left or self.video.rotate_right):
+            raise ValueError("labels of images that are to be turned are not read: leave labels out, and label the recording")
         if len(ours) < len(self.landmarks):
             raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
         if unknown := sorted({*(columns or {}), *labels, *self.tool.landmarks_mm, *self.tool.pivot_s} - ours):

@@ -168,11 +168,22 @@ class StereoSource:
                 if images[0].shape[axis] % 2:
                     raise ValueError(f"{places[0]}: images of {sizes[0]} do not split into equal halves. Check layout.")
                 images = np.split(images[0], 2, axis=axis)
-            left, right = images[::-1] if self.video.exchanged else images
+            turns = self.video.rotate_left, self.video.rotate_right
+            images = images[::-1] if self.video.exchanged else images
+            left, right = (np.rot90(image, -turn // 90) for image, turn in zip(images, turns, strict=True))
+            if any(turns):
+                left, right = _padded(left, right)
             if left.shape != right.shape:
                 what = f"left and right frames differ in size ({' and '.join(sizes)})"
-                raise ValueError(f"{places[-1]}: {what}; export both alike.")
+                cure = "export both alike. If one camera is turned, set video.rotate_left or video.rotate_right"
+                raise ValueError(f"{places[-1]}: {what}; {cure}.")
             yield left, right
+
+
+def _padded(*images: np.ndarray) -> Iterator[np.ndarray]:
+    """The images with black at the right and at the bottom, where pixels keep their coordinates, up to a common size."""
+    height, width = np.max([image.shape[:2] for image in images], axis=0)
+    return (np.pad(i, ((0, height - i.shape[0]), (0, width - i.shape[1]), (0, 0))) for i in images)
 
 
 def open_stereo(folder: Path, video: Video) -> StereoSource:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
-from lib.matching.band import MAX_PIXELS, match_band
+from lib.matching.band import MAX_PIXELS, RigMisfitError, match_band
 from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
 from lib.matching.masks import checked_mask, dark_mask, glint_mask, tool_mask
@@ -15,7 +15,7 @@ from lib.matching.opencv import match_with
 from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
-__all__ = ["RECTIFIED", "Matches", "checked_mask", "dark_mask", "glint_mask", "match", "tool_mask"]
+__all__ = ["RECTIFIED", "Matches", "RigMisfitError", "checked_mask", "dark_mask", "glint_mask", "match", "tool_mask"]
 
 
 def match(

@@ -22,6 +22,8 @@ Where = tuple[str, tuple[float, float] | None, float]
 
 #: Largest number of pixels of the canvas (the common rectified image), for each setting.
 MAX_PIXELS = {"fast": 400_000, "quality": 3_000_000}
+#: The score is 0 if DeepMatching's is less than this many times that of another place on the line: a printed grid repeats.
+LEAST_UNIQUE = 1.1
 #: Number of cells around a patch that its sub-pixel step uses, too.
 REFINE_MARGIN = {"fast": 0, "quality": 1}
 
@@ -55,6 +57,10 @@ REACH = 2
 RIDGE = 0.05
 
 
+class RigMisfitError(ValueError):
+    """Most matches are far from the epipolar lines of the rig."""
+
+
 def plan_search(
     images: Images, masks: Masks, rig: StereoRig, where: Where
 ) -> tuple[Rectification, float, tuple[float, float], float] | None:
@@ -80,7 +86,7 @@ def plan_search(
             what = f"the median distance of {len(displacement)} free matches from their epipolar lines is {misfit:.1f} px"
             cure = "Calibrate again, or check that left and right are not exchanged"
             allowed = f"{max_epipolar_px:.1f} px are allowed (max_epipolar_px)"
-            raise ValueError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
+            raise RigMisfitError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
         off_line_px = float(np.median(displacement[:, 1]))
         low, high = np.percentile(displacement[:, 0], (0.5, 99.5))
         margin = 4 / min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
@@ -167,6 +173,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
         raise ValueError(f"budget_bytes: {what}, {budget}. Narrow depth_range_mm, or take setting='fast'.")
     left, right = _descriptors(images, masks, rectification, (low, high), off_line, off_line_px)
     found, volume = _match(left, right, low, off_line, reciprocal=reciprocal)
+    unique = found.uniqueness >= LEAST_UNIQUE
     x, y = torch.from_numpy(found.patch.T)
     along = torch.from_numpy(found.cell[:, 0] - low)
     ratio = peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
@@ -186,8 +193,9 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     return Matches(
         on_image(rectification.left_from_canvas, canvas),
         on_image(rectification.right_from_canvas, canvas + displacement * CELL_PX + (0.0, off_line_px)),
-        1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
+        unique / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
         covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
+        ambiguous=float(1 - unique.mean()) if unique.size else 0.0,
     )  # fmt: skip
 
 

@@ -150,6 +150,7 @@ class VolumeMatches(NamedTuple):
     displacement: np.ndarray  # (n, 2), sub-cell: at the vertex of a parabola through the response and its neighbours
     peaked: np.ndarray  # (n,) bool, True if the response has an interior peak along x
     reciprocal: np.ndarray  # (n,) bool, True if no other patch fits the same position in the right image better
+    uniqueness: np.ndarray  # (n,) score of the displacement over the largest one more than 4 to 8 cells away along x
 
     def keep(self, chosen: np.ndarray) -> Self:
         """The matches of a mask (n,) or of indices."""
@@ -211,14 +212,20 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
     in_x, in_y = ([np.flatnonzero(index == i) for i in range(index[0], index[-1] + 1)] for index in (bin_x, bin_y))
     bins = volume.new_full((gy + len(in_y) - 1, gx + len(in_x) - 1), -torch.inf)
-    best, flat = volume.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long)
+    best, rival, flat = *volume.new_empty(2, gy, gx), torch.empty(gy, gx, dtype=torch.long)
+    own_x = torch.from_numpy(bin_x - bin_x[0])
 
     def search(top: int) -> list[list[torch.Tensor]]:
         """Find the best displacements of a chunk of lattice rows; returns the largest scores (chunk, gx) for each bin."""
         part = slice(top, min(top + ROWS, gy))
         score = unpool(volume[part], scores[part], v % 2)
         torch.max(score.flatten(2), dim=2, out=(best[part], flat[part]))
-        return [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
+        strongest = [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
+        elsewhere = torch.stack([torch.stack(row) for row in strongest]).amax(dim=0)
+        for x, own in enumerate(elsewhere):  # the bin of the match and those next to it are no rivals
+            own.masked_fill_((own_x[flat[part] % n] - x).abs() <= 1, 0.0)
+        torch.amax(elsewhere, dim=0, out=rival[part])
+        return strongest
 
     tops = range(0, gy, ROWS)
     with ThreadPoolExecutor(2) as executor:
@@ -229,7 +236,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
                     torch.maximum(there, chunk, out=there)
     y, x = torch.meshgrid(torch.arange(gy), torch.arange(gx), indexing="ij")
     j, k = flat // n, flat % n
-    own = (torch.from_numpy(bin_y - bin_y[0])[j] + y, torch.from_numpy(bin_x - bin_x[0])[k] + x)
+    own = (torch.from_numpy(bin_y - bin_y[0])[j] + y, own_x[k] + x)
     passed = best >= bins[own]
     kept = torch.isfinite(best) & (passed | (not reciprocal))
 
@@ -238,7 +245,8 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     vertex_y, _ = _parabola(volume, place, 2)
     patch, cell = torch.stack([place[1], place[0]], dim=1), torch.stack([place[3] + low, place[2] - v], dim=1)
     displacement = cell + torch.stack([vertex_x, vertex_y], dim=1).double()
-    return VolumeMatches(*(part.numpy() for part in (patch, cell, displacement, peaked, passed[kept])))
+    uniqueness = (best / rival)[kept]
+    return VolumeMatches(*(part.numpy() for part in (patch, cell, displacement, peaked, passed[kept], uniqueness)))
 
 
 def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:

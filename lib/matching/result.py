@@ -23,6 +23,8 @@ class Matches:
             band), or to within a pixel (SGBM, DIS).  `match` drops the others by default.
         method: Name of the matcher.
         epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
+        ambiguous: Share of the matches that fit another place on their epipolar line nearly as well (band): their score is 0,
+            so `match` drops them by default.  NaN for other matchers.
     """
 
     u_left: np.ndarray
@@ -33,6 +35,7 @@ class Matches:
     reciprocal: np.ndarray
     method: str
     epipolar_px: float = float("nan")
+    ambiguous: float = float("nan")
 
     @classmethod
     def none(cls, method: str) -> Self:

@@ -43,6 +43,7 @@ class SurfaceFit:
     bending_energy: np.ndarray = field(repr=False)  # (k,) c.R.c of each output
     weights: np.ndarray = field(repr=False)  # (n, k) factors on the absolute residuals
     residual: np.ndarray = field(repr=False)  # (n, k)
+    inflation: float = 1.0  # least factor on the variance, for common errors of neighbours that the surface follows
 
     @cached_property
     def posterior(self) -> list[tuple[np.ndarray, float]]:
@@ -75,15 +76,11 @@ class SurfaceFit:
     @cached_property
     def agreement(self) -> tuple[np.ndarray, np.ndarray]:
         """Of residual signs: variance (k,) of their sums over quarter cells, 1 = independent; correlation (k, k)."""
-        signs, grid = np.sign(self.residual), self.problem.grid
-        cell, t = grid.locate(self.problem.u)
-        quarter = (2 * cell + (t >= 0.5)) @ (1, 2 * grid.cells[0])
-        _, group, counts = np.unique(quarter, return_inverse=True, return_counts=True)
-        sums = np.stack([np.bincount(group, column) for column in signs.T], axis=1)
+        signs, inflation = np.sign(self.residual), sign_inflation(self.problem.grid, self.problem.u, self.residual, 0.5)
         norm = np.sqrt(np.maximum((signs**2).sum(axis=0), 1.0))
         correlation = signs.T @ signs / np.outer(norm, norm)
         np.fill_diagonal(correlation, 1.0)
-        return np.maximum((sums**2).sum(axis=0) / counts.sum(), 1.0), correlation
+        return np.maximum(inflation, self.inflation), correlation
 
 
 @dataclass(frozen=True)
@@ -156,8 +153,9 @@ class BSplineSurface:
 
         With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
         C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
-        Errors of neighbouring matches are correlated, so C is inflated by the correlation of the signs of their residuals;
-        the outputs are correlated as these signs are.  Common errors of all points, such as the calibration's, are left out.
+        Errors of neighbouring matches are correlated, so C is inflated by the correlation of the signs of their residuals,
+        or by `SurfaceFit.inflation` if that is more; the outputs are correlated as these signs are.  Common errors of all
+        points, such as the calibration's, are left out.
         Where no point is near, as below a mask, only the prior limits the surface: it does not expect a step there, nor all
         of an undulation as wide as the mask (in simulations 67 % of such errors were within 1.96 standard deviations).
         """
@@ -209,6 +207,15 @@ class BSplineSurface:
         u[seen] = np.where((np.abs(before + step - u[seen]) < 1e-6).all(axis=1, keepdims=True), u[seen], np.nan)
         nearest = self(u)
         return ToolDistance(along_view, np.einsum("nk,nk->n", x - nearest, self.normal(u)), nearest, u)
+
+
+def sign_inflation(grid: SplineGrid, u: np.ndarray, residual: np.ndarray, cells: float) -> np.ndarray:
+    """Variance (k,) of the sums of the signs of residuals (n, k) in squares of so many cells; 1 = independent, at least 1."""
+    cell, t = grid.locate(u)
+    square = np.floor((cell + t) / cells).astype(np.intp) @ (1, 4 * grid.size)
+    _, group, counts = np.unique(square, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(group, column) for column in np.sign(residual).T], axis=1)
+    return np.maximum((sums**2).sum(axis=0) / counts.sum(), 1.0)
 
 
 def fewest_points(control: tuple[int, int]) -> int:

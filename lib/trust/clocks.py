@@ -191,7 +191,8 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")
             text = f"{who} turned by 180 degrees: rows are read upwards, in {-1e3 * readout_s:.1f} +- {1e3 * sd:.1f} ms."
-            cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
+            keys = " and ".join(f"video.rotate_{SIDES[view]} = 180" for view in views)
+            cure = f"Turn {them} by 180 degrees ({keys} in the mapping), with readout_s = {-readout_s:.4f}."
             yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known, images=views)
         elif len(views) == 2:
             text = f"Residuals of a moving tool grow row by row: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."

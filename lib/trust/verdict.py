@@ -257,10 +257,14 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     yield "convergence_high", min(angle, 180 - angle), text, unless, name
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
-    mirrored, roll = optics(c).mirrored, abs(np.rad2deg(optics(c).roll_rad))
-    text = f"The images are rotated by {roll:.0f} degrees against each other."
+    mirrored, roll = optics(c).mirrored, np.rad2deg(optics(c).roll_rad)
+    text = f"The images are rotated by {abs(roll):.0f} degrees against each other."
+    cure = "Rotate one of them back: surfaces cannot be matched otherwise."
+    if back := round(-roll / 90) * 90 % 360:
+        cure += f" Import again, with video.rotate_right = {back} in the mapping if the right image is the turned one,"
+        cure += f" or with video.rotate_left = {-back % 360} if the left one is."
     if mirrored not in ("left", "right", "left or right"):  # a mirror image looks rotated, too
-        yield "roll", roll, text, "Rotate one of them back: surfaces cannot be matched otherwise.", "turned_image"
+        yield "roll", abs(roll), text, cure, "turned_image"
     text, cure = f"One image is a mirror image ({mirrored}).", "Flip that image when recording."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
     nearness, sd = c.inverse_distance_per_mm

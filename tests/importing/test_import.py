@@ -59,6 +59,39 @@ def thinned(source: foreign.Shipped, every: int) -> foreign.Shipped:
     return replace(source, robot_s=source.robot_s[::every], x_mm=source.x_mm[::every])
 
 
+
+def test_images_of_a_turned_camera_are_turned_back(tmp_path, shipped):
+    """Black at the right and at the bottom makes the sizes equal, so pixels keep their coordinates."""
+    small = replace(shipped, frames=shipped.frames[:3], time_s=shipped.time_s[:3])
+
+    def turned(folder, source):
+        text = foreign.images(folder, source)
+        for path in (folder / "cam R").iterdir():
+            cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -1))  # clockwise
+        return text + 'format = "png"\n'
+
+    folder, mapping = source_of(tmp_path, small, turned, foreign.robot_csv)
+    with pytest.raises(ValueError, match=r"differ in size .* set video\.rotate_left or video\.rotate_right"):
+        import_recording(folder, mapping, tmp_path / "refused")
+    given = mapping.read_text("utf-8")
+    for left, right in ((0, 270), (90, 0), (180, 0)):  # the last one does not turn it back, so black is needed
+        mapping.write_text(given.replace("[video]\n", f"[video]\nrotate_left = {left}\nrotate_right = {right}\n"), "utf-8")
+        with warnings.catch_warnings(action="ignore"):  # three frames and a long log
+            did = import_recording(folder, mapping, tmp_path / "eye", overwrite=True)["did"]
+            frame = Recording.open(tmp_path / "eye").frames[1]
+        assert any(f"turned clockwise by {left} degrees, right ones by {right};" in line for line in did)
+        turns = -left // 90, -(right + 90) // 90
+        expected = [np.rot90(image, turn) for image, turn in zip(small.frames[1], turns, strict=True)]
+        size = np.max([image.shape for image in expected], axis=0)
+        for image, own in zip((frame.left, frame.right), expected, strict=True):
+            height, width = own.shape[:2]
+            assert image.shape == tuple(size) and (image[:height, :width] == own).all()
+            assert not image[height:].any() and not image[:, width:].any()
+    mapping.write_text(f"{mapping.read_text('utf-8')}[labels]\nkind = 'coco'\nfile = 'labels.json'\n", "utf-8")
+    with pytest.raises(ValueError, match="labels of images that are to be turned are not read"):
+        read_mapping(mapping)
+
+
 def content(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 

@@ -230,6 +230,16 @@ def test_images_that_do_not_belong_together_give_no_match(textured, method):
     assert not len(match(textured, blank, method=method, rig=RECTIFIED))
 
 
+def test_a_texture_that_repeats_along_the_lines_is_ambiguous(textured):
+    rng, options = np.random.default_rng(0), {"rig": RECTIFIED, "depth_range_mm": (-50, 50), "max_epipolar_px": np.inf}
+    for period_px, share in ((40, (0.9, 1)), (160, (0, 0.1))):
+        repeated = np.tile(textured[:, :period_px], 160 // period_px)
+        pair = [np.clip(np.roll(repeated, shift, axis=1) + rng.normal(0, 2, repeated.shape), 0, 255) for shift in (0, 6)]
+        found = match(*(image.astype(np.uint8) for image in pair), **options)
+        assert share[0] <= found.ambiguous <= share[1]
+        assert (len(found) > 100) == (period_px == 160)
+
+
 def test_epipolar_lines_of_near_cameras_are_followed():
     """At 25 mm they deviate from the canvas's rows by up to 10 px, most of all in the corners."""
     geometry = {"image_size_px": (640, 360), "pixels_per_mm": (34, 34), "inverse_distance_per_mm": 1 / 25}

@@ -20,6 +20,8 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.render import render_pair
 from lib.simulator.rig import Microscope
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
+from lib.surface.bspline import sign_inflation
+from lib.surface.reconstruct import in_company
 from lib.workbench import results
 from notebooks import real_data
 from notebooks.studies import surface_evaluation as evaluation
@@ -89,6 +91,18 @@ def test_epipolar_filter_drops_what_is_off_the_line(scene, result):
     assert not len(epipolar_inliers(scene.rig, matches.keep(np.zeros(len(matches), dtype=bool))))
 
 
+def test_epipolar_filter_allows_for_lines_that_a_wrong_calibration_turns_and_bends(scene, result):
+    """Else it would keep the matches of one stripe of the image, and wrong ones beside it."""
+    matches, (width, height) = result.matches, (640, 360)
+    x, y = (matches.u_left / (width, height) - 0.5).T
+    off = (3 * x - 4 * y + 2 * x * y + y**2)[:, None] * scene.rig.epipolar_normal[2:]
+    wrong = np.arange(len(matches)) % 5 == 0
+    off[wrong] += 5 * scene.rig.epipolar_normal[2:]
+    off /= np.sum(scene.rig.epipolar_normal[2:] ** 2)  # now px of distance from the lines
+    kept = epipolar_inliers(scene.rig, replace(matches, u_right=matches.u_right + off))
+    assert kept[~wrong].mean() > 0.9 and kept[wrong].mean() < 0.02
+
+
 def test_a_match_that_no_point_explains_is_dropped_alone(scene, result):
     """Barrel distortion, if it is estimated too strong, images nothing at the corners: their distance is NaN."""
     barrel = NearAffineCamera(scene.rig.left.matrix, 0.0, (320, 180), radial_per_px2=-2e-6)
@@ -97,6 +111,27 @@ def test_a_match_that_no_point_explains_is_dropped_alone(scene, result):
     matches = replace(result.matches.keep(np.arange(4)), u_left=u, u_right=scene.rig.right.project(scene.truth(u)))
     assert np.isnan(rig.epipolar_distance(matches.u_left, matches.u_right)).tolist() == [False, False, True, False]
     assert epipolar_inliers(rig, matches).tolist() == [True, True, False, True]
+
+
+def test_errors_that_neighbours_share_inflate_the_covariance(scene, result):
+    """The surface follows them, so only the distances from the epipolar lines show them."""
+    rng, grid = np.random.default_rng(0), SplineGrid((0, 0, 100, 100), (13, 13))
+    u = rng.uniform(0, 100, (4000, 2))
+    alone, shared = rng.normal(size=(4000, 1)), rng.normal(size=(5, 5))[tuple((u // 20).astype(int).T)][:, None]
+    assert sign_inflation(grid, u, alone, 2) < 1.3
+    assert sign_inflation(grid, u, alone + shared, 2) > 20
+    fit = result.surface.fit
+    twice = replace(result.surface, fit=replace(fit, inflation=4 * max(fit.agreement[0].max(), fit.inflation)))
+    ratio = twice.covariance([[320, 180]]) / result.surface.covariance([[320, 180]])
+    assert 1 <= fit.inflation < 8 and (np.diag(ratio[0]) > 3.9).all()
+
+
+def test_points_without_neighbours_are_dropped():
+    x, y = (side.ravel() for side in np.mgrid[:12, :15] * 0.1)
+    points = np.column_stack([x, y, 0.3 * x])
+    points[[40, 100, 101], 2] += 3.0
+    assert np.flatnonzero(~in_company(points)).tolist() == [40, 100, 101]
+    assert in_company(points[:2]).all() and not len(in_company(points[:0]))
 
 
 @pytest.mark.parametrize(("black", "blur_px"), [(0, 0), (16, 0), (0, 6)])

@@ -56,6 +56,12 @@ def test_an_image_that_is_turned_against_the_other_is_named():
     data = made(40, 0)
     turned = replace(data, u_right=np.array([1919.0, 1079.0]) - data.u_right)
     assert names(data) == {} and names(turned) == {"turned_image": LEVELS[2]}
+    for clockwise, quarter in ((90, [[0, -1], [1, 0]]), (270, [[0, 1], [-1, 0]])):  # y points down
+        data_turned = replace(data, u_right=data.u_right @ np.transpose(quarter) + 1500.0)
+        calibration = calibrate(data_turned, image_size_px=(1920, 1080))
+        (reason,) = (r for r in judge(data_turned, calibration).reasons if r.name == "turned_image")
+        back = f"video.rotate_right = {360 - clockwise} in the mapping", f"video.rotate_left = {clockwise} if"
+        assert all(key in reason.cure for key in back)
     mirrored = replace(data, u_right=[1919.0, 0.0] + data.u_right * [-1.0, 1.0])
     assert "turned_image" not in names(mirrored) and "mirrored" in names(mirrored)
 
