@@ -17,7 +17,9 @@ from lib.correspondences import FEWEST_TO_TRAIN, LANDMARKS, TRAIN_FURTHER, Corre
 from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
+from lib.trust.clocks import PAIR_AGAIN
 from lib.trust.diagnosis import Diagnosis, diagnose, stated
+from lib.trust.fitting import SIDES
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -174,8 +176,8 @@ def judge(
             cure = "Did a camera move, or were left and right not taken at the same instant? Calibrate again."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for robot errors
-            health = health.without_robot
+        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for that
+            health = health.without_robot if len(best.images) == 2 else health.without_others
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
@@ -365,11 +367,12 @@ def assess(
 def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:
     """The diagnosis of some frames, corrected by the scene behind the tool, which moves only if a camera does."""
     best = diagnosis.best
-    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift") or len(best.images) < 2:
+    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift"):
         return diagnosis
     pairs = (recording.frames[int(i)] for i in (frames.min(), frames.max()))
     first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-    moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h.name != best.name]  # NaN decides nothing
+    moved_px = first.moved_px(last)[list(best.images)]  # NaN decides nothing
+    others = [h for h in diagnosis.hypotheses if h.name != best.name]
     still = (best.value > _NEARER_PX + _TIMES * moved_px).all()
     if best.name == "tool_slipped":
         return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
@@ -380,8 +383,12 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
         text += " The scene behind the tool stands still: the robot drifts, or the detector's error depends on the pose."
         cure = f"{_OVERLAYS}. If landmarks are marked beside the tool, {TRAIN_FURTHER}; else look for slack in the robot."
         return Diagnosis((replace(best, name="robot_drifts", text=text, cure=cure), *others))
-    text = "Images and robot disagree" + best.text[best.text.index(" at about frame") :]
-    text += " The scene behind the tool stands still, so the robot's report jumped."
+    when = best.text[best.text.index(" at about frame") :]
+    if len(best.images) == 1:  # the other image and the robot agree
+        text = f"The {SIDES[best.images[0]]} images disagree with the robot{when.replace(' at', ' from', 1)}"
+        text += " The scene behind the tool stands still, so they belong to other instants, or the detector errs in them."
+        return Diagnosis((replace(best, name="frame_order", text=text, cure=PAIR_AGAIN), *others))
+    text = f"Images and robot disagree{when} The scene behind the tool stands still, so the robot's report jumped."
     return Diagnosis((replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + "."), *others))
 
 

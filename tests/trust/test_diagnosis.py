@@ -436,6 +436,16 @@ def test_images_that_agree_accuse_no_detector():
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
 
 
+def test_a_camera_that_lost_an_image_of_a_slow_video_did_not_move():
+    """From frame 20 on, each right image is the next one."""
+    usual = take(fps=2.5)
+    right = usual.data.u_right.reshape(-1, 3, 2)
+    right = right[np.minimum(np.arange(40) + (np.arange(40) >= 20), 39)].reshape(-1, 2)
+    best = found(replace(usual, data=replace(usual.data, u_right=right))).best
+    assert best.name == "frame_order" and best.images == (1,)
+    assert "right images belong to other instants, mostly +400 ms from those stated, first in frame 20." in best.text
+
+
 @pytest.mark.parametrize(("frames", "kept"), [(100, 60), (200, 60), (100, 95)])
 def test_images_sorted_as_text_are_named_from_some_of_them(frames, kept):
     whole = take("images sorted as text", frames=frames)

@@ -281,6 +281,27 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     assert "camera_moved" in names and "robot_jumped" not in names
 
 
+@pytest.mark.parametrize(("scene_px", "named"), [(0.0, "frame_order"), (60.0, "camera_moved")])
+def test_a_scene_that_stands_still_clears_one_camera(decoded_once, monkeypatch, scene_px, named):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, scene_px]))
+    moved = Hypothesis("camera_moved", "The right camera moved or zoomed at about frame 20: the images shift by 77.0 px.",
+                       "Calibrate.", 77.0, 0.0, "px", explained=0.6, gain=40.0, images=(1,))  # fmt: skip
+    best = verdicts.with_scene(Diagnosis((moved,)), recording, np.arange(len(recording))).best
+    assert best.name == named
+    assert scene_px or "The right images disagree with the robot from about frame 20: the images shift by 77" in best.text
+
+
+def test_what_one_image_explains_accuses_no_detector():
+    """The images of a pair then disagree, whatever the detector does."""
+    apart = Health(np.arange(20), {"epipolar": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
+    late = Hypothesis("frame_order", "Late.", "Pair them.", 50.0, 0.0, "%", explained=0.9, gain=100.0, images=(1,))
+    for images, accused in (((1,), False), ((0, 1), True)):
+        diagnosis = Diagnosis((replace(late, images=images),))
+        verdict = judge(None, None, diagnosis=diagnosis, health=apart, error=DataError("no."))
+        assert ("detector_unfit" in [reason.name for reason in verdict.reasons]) == accused
+
+
 def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_do(decoded_once, monkeypatch):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
