@@ -270,6 +270,17 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         yield certain("frozen_kinematics", fit, frozen, text, cure)
+    for k, name in enumerate(LANDMARKS):
+        still, moved_px = (sizes[1][:, k] < 1e-9) & (step_x > 1e-6), np.fmax(*(size[:, k] for size in sizes[2:]))
+        if still.mean() < 0.02:
+            continue
+        apart = np.isin(problem.frame, np.flatnonzero(still) + 1) & (problem.landmark == k)
+        fit = problem.fit(start=case.null.start, apart=apart)
+        wrong = still & (moved_px > 8 * fit.shapes[0].scale)
+        if wrong.mean() >= 0.02 and wrong.sum() > 0.5 * still.sum():  # else it rests, and some of its detections err
+            text = f"the robot's position of {name} alone stands still while it moves in the images"
+            cure = f"Log {name} at every sample; where its columns of kinematics.csv repeat an old position leave them blank."
+            yield certain("frozen_kinematics", fit, wrong, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
     far = [step > 8 * noise for step in steps]  # if one image repeats, the other shows whether the tool moved

@@ -436,6 +436,20 @@ def test_images_that_agree_accuse_no_detector():
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
 
 
+def test_a_log_that_repeats_one_landmark_alone_accuses_this_landmark():
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0)
+
+    def stuck(scene, t, x):
+        held = x.copy()
+        held[(t > 0.8) & (t < 1.6), 1] = x[np.searchsorted(t, 0.8), 1]
+        return held
+
+    scene.edit_report.append(stuck)
+    best = found(scene.take()).best
+    assert best.name == "frozen_kinematics" and best.value == pytest.approx(30, abs=6)
+    assert "position of tip_1 alone stands still" in best.text and "leave them blank" in best.cure
+
+
 def test_a_camera_that_lost_an_image_of_a_slow_video_did_not_move():
     """From frame 20 on, each right image is the next one."""
     usual = take(fps=2.5)
