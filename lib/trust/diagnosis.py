@@ -8,7 +8,7 @@ Its evidence is its gain in log likelihood minus a penalty for its parameters (B
 from collections import ChainMap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
 from scipy.ndimage import binary_opening, median_filter
@@ -40,6 +40,8 @@ _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
 _MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
 _OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
+_UNITS = (1e3, 1e-3, 1e2, 1e-2, 1e1, 1e-1)  # ratios of units of length that are tried
+_ALIKE, _RIGID = 5.0, 0.1  # landmarks of a tool move as far within this factor, and stay apart within this share of it
 _STILL_PX, _STILL_MM = 0.3, 0.04  # detections in copies of one picture vary by less, and so does a robot at rest
 
 
@@ -353,6 +355,25 @@ def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_
     return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
 
 
+def _mixed_units(data: Correspondences) -> list[Hypothesis]:
+    """A landmark in another unit of length than the others: it keeps its distance from them only times a power of ten."""
+    x = data.grid("x_mm")[:, : len(LANDMARKS)]
+    x = x[np.isfinite(x).all(axis=(1, 2))]
+    moved = np.median(np.abs(x - np.median(x, axis=0)), axis=0).max(axis=1) if len(x) else np.zeros(x.shape[1])
+    for factor, k in product(_UNITS if moved.min() > 0 else (), range(x.shape[1])):
+        others = [j for j in range(x.shape[1]) if j != k]
+        if (np.abs(np.log(factor * moved[k] / moved[others])) > np.log(_ALIKE)).any():
+            continue
+        for other in others:
+            before, after = (np.linalg.norm(s * x[:, k] - x[:, other], axis=1).std() for s in (1.0, factor))
+            if after < _RIGID * moved[other] < before:
+                name = LANDMARKS[k]
+                text = f"The robot's positions of {name} have another unit than the others: times {factor:g} they fit them."
+                cure = f"Multiply the columns of {name} in kinematics.csv by {factor:g}, or state their unit in the mapping."
+                return [Hypothesis("mixed_units", text, cure, factor, 0.0, "times", 1.0, float(len(data)))]
+    return []
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """The hypotheses, most likely first."""
@@ -408,6 +429,11 @@ def diagnose(
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
+    if mixed := _mixed_units(data):
+        return Diagnosis((*mixed,))
+    if (problem.y[:, 0] == problem.y[:, 1])[problem.used.all(axis=1)].all(axis=1).mean() > 0.5:
+        text, cure = "Left and right images are the same.", "Put the right camera's own images into RECORDING."
+        return Diagnosis((Hypothesis("same_images", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
     if moved_px < _STILL_PX and moved_mm > _STILL_MM:

@@ -73,6 +73,8 @@ _LABEL_PX = 3.0
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 _BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
+#: Causes of which a refused calibration says less, or something else.
+_KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
@@ -162,7 +164,10 @@ def judge(
         if name == "refused" or (name == "no_detection" and data is not None and data.is_by_hand):  # the error names its cure
             few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
             cure = _MORE_FRAMES if few else "Correct that, then check again."
-        found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
+        text = f"There is no calibration: {error}"
+        if best is not None and best.name in _KNOWS_BETTER:
+            text, cure = "There is no calibration.", "Correct what the diagnosis names, then check again."
+        found.append(Reason(name, LEVELS[2], text, cure))
     else:
         what = data, calibration, robot_accuracy_mm
         for finding in (*_residuals(*what), *_geometry(*what)):

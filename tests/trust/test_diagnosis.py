@@ -436,6 +436,31 @@ def test_images_that_agree_accuse_no_detector():
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
 
 
+@pytest.mark.parametrize(("landmark", "factor"), [(0, 1000.0), (2, 1000.0), (1, 0.1), (2, 0.001)])
+def test_a_landmark_in_another_unit_than_the_others_is_named(landmark, factor):
+    usual = take()
+    own = (usual.data.landmark == landmark)[:, None]
+    x_mm = np.where(own, (usual.data.x_mm + [30.0, -20.0, 50.0]) / factor, usual.data.x_mm + [30.0, -20.0, 50.0])
+    (named,) = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).hypotheses
+    name = ("base", "tip_1", "tip_2")[landmark]
+    assert named.name == "mixed_units" and named.value == factor and f"columns of {name} in kin" in named.cure
+
+
+def test_a_base_that_hardly_moves_is_in_the_unit_of_the_tips():
+    """As where the tool turns about the incision."""
+    usual = take()
+    x = usual.data.x_mm.reshape(-1, 3, 3)
+    still = x - x[:, :1] + np.array([30.0, -20.0, 50.0]) + 0.01 * x[:, :1]
+    named = found(replace(usual, data=replace(usual.data, x_mm=still.reshape(-1, 3)))).hypotheses
+    assert "mixed_units" not in [h.name for h in named]
+
+
+def test_copies_of_one_camera_are_named():
+    usual = take()
+    (named,) = found(replace(usual, data=replace(usual.data, u_right=usual.data.u_left))).hypotheses
+    assert named.name == "same_images" and "the right camera's own images into RECORDING" in named.cure
+
+
 def test_a_log_that_repeats_one_landmark_alone_accuses_this_landmark():
     scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0)
 

@@ -170,6 +170,13 @@ def test_a_refusal_names_its_own_cure():
     assert "cover a few depths as well" in reason.text
 
 
+def test_a_refusal_does_not_contradict_the_diagnosis():
+    cause = Hypothesis("mirrored_axis", "An axis is mirrored.", "Negate one.", 11.0, 0.1, "degrees", 1.0, 100.0)
+    verdict = judge(None, None, diagnosis=Diagnosis((cause,)), error=DataError("exchange left and right."))
+    assert [reason.name for reason in verdict.reasons] == ["mirrored_axis", "refused"]
+    assert "exchange" not in str(verdict)
+
+
 @pytest.fixture(scope="module")
 def decoded_once():
     """The images of the recording that ships."""
