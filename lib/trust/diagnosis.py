@@ -30,7 +30,9 @@ _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and le
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, and `calibrate` corrects such offsets
 _LEAST_LENGTH_MM = 1.0  # larger than the error of any tool calibration
 _LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # lengths of the tool that are tried, if the robot's report lacks it
-_AS_GOOD = 6.0  # gain in log likelihood of moved cameras (16 numbers) over a slipped tool (3) that rules the latter out
+#: Gain in log likelihood of moved cameras (16 numbers), or of a jump (6), over a slipped tool (3) that rules the latter out.
+AS_GOOD = 6.0
+_SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (16 numbers) whose frames are examined
 _OPENED = 1.25  # a smaller factor may come from constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
 _BENDS = 1.5  # least motion of a bent tool's tips, as a multiple of the error that the detector states for the base
@@ -216,20 +218,23 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     late = (problem.frame >= frame)[:, None]
     y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
     exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
-    number = problem.number[frame]  # in the recording
-    parts = f"--frames {problem.number[0]}:{number}, --frames {number}:{problem.number[-1] + 1}"
+    changes = both.total - case.null.total > _SURE_CHANGE  # else no hypothesis is named, and the search would take long
+    number, first, last = problem.number[[frame, *(problem.similar_cuts(frame, both) if changes else (frame, frame))]]
+    parts = f"--frames {problem.number[0]}:{first}, --frames {last}:{problem.number[-1] + 1}"
+    when = f"at about frame {number}" + (f" ({first} to {last})" if first < last else "")  # in the recording
     text = f"From about frame {number} on, the left image is the right one."
     cure = "Exchange the images of these frames between left/ and right/."
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
     yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
     slipped = problem.axes * late[..., None]
     fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
-    if fit.total > both.total - _AS_GOOD:
-        size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
-        text = f"The tool slipped at about frame {number}, by {size:.0f} um ({along} um in the tool's axes)."
-        cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
-        cure += "Where the tool does not turn, a robot whose zero changed looks the same."
-        yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
+    size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
+    text = f"The tool slipped {when}, by {size:.0f} um ({along} um in the tool's axes)."
+    cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
+    cure += "Where the tool does not turn, a robot whose zero changed looks the same."
+    slip = case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
+    # Ruled out, it only counts again if the scene stands still (`lib.trust.verdict.with_scene`).
+    yield slip if fit.total > both.total - AS_GOOD else replace(slip, gain=0.0)
     together = case.linear(problem.of_motion(late[:, 0]))
     for views, fit in (((0, 1), both), ((0, 1), together), ((0,), None), ((1,), None)):
         fit = fit or case.linear(problem.of_later_cameras(frame, views))
@@ -237,7 +242,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         how = "moved together" if fit is together else "moved or zoomed"
-        text = f"{who} {how} at about frame {number}: the images shift by {size:.1f} px."
+        text = f"{who} {how} {when}: the images shift by {size:.1f} px."
         cure = f"Calibrate the frames before and after separately ({parts}). "
         cure += "lib.registration.register_images can follow a move, but no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)

@@ -18,7 +18,7 @@ from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
 from lib.trust.clocks import PAIR_AGAIN
-from lib.trust.diagnosis import Diagnosis, diagnose, stated
+from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
 from lib.trust.fitting import SIDES
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
@@ -393,6 +393,10 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
         text = f"The {SIDES[best.images[0]]} images disagree with the robot{when.replace(' at', ' from', 1)}"
         text += " The scene behind the tool stands still, so they belong to other instants, or the detector errs in them."
         return Diagnosis((replace(best, name="frame_order", text=text, cure=PAIR_AGAIN), *others))
+    jump = min((h for h in diagnosis.hypotheses if h.name == best.name), key=lambda h: h.evidence[2])  # of fewest parameters
+    slip = next((h for h in others if h.name == "tool_slipped"), None)
+    if slip and slip.evidence[0] > jump.evidence[0] - AS_GOOD:
+        return Diagnosis((replace(slip, gain=best.gain), *(h for h in others if h is not slip)))
     text = f"Images and robot disagree{when} The scene behind the tool stands still, so the robot's report jumped."
     return Diagnosis((replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + "."), *others))
 

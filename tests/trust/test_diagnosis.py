@@ -47,6 +47,17 @@ def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
     assert best.name == "camera_moved" and "zoomed at about frame 20" in best.text and "no zoom" in best.cure
 
 
+def test_frames_that_may_belong_to_either_side_of_a_small_zoom_are_left_out():
+    scene = take()
+    data, centre = scene.data, (np.array(scene.image_size_px) - 1) / 2
+    zoom = np.where(data.frame >= 20, 1.018, 1.0)[:, None]
+    left, right = (centre + zoom * (u - centre) for u in (data.u_left, data.u_right))
+    best = found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+    first, last = map(int, re.search(r"at about frame \d+ \((\d+) to (\d+)\)", best.text).groups())
+    assert first < last and first <= 20 <= last
+    assert f"(--frames 0:{first}, --frames {last}:40)" in best.cure
+
+
 def test_a_microscope_that_moves_as_a_whole_needs_six_numbers():
     spoiled = take("camera moved", "0.3 degrees", seed=8)
     first, second = [h for h in found(spoiled).hypotheses if h.name == "camera_moved" and len(h.images) == 2]

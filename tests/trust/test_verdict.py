@@ -288,6 +288,21 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     assert "camera_moved" in names and "robot_jumped" not in names
 
 
+@pytest.mark.parametrize(("slip_gain", "named"), [(850.0, "tool_slipped"), (770.0, "robot_jumped")])
+def test_where_the_scene_stands_still_a_slipped_tool_competes_with_a_jump_only(monkeypatch, decoded_once, slip_gain, named):
+    """Sixteen numbers of cameras that did not move explain some of the detector's errors, too."""
+    recording, when = Recording.open(paths.SHIPPED_RECORDING), "at about frame 20: the images shift by 33.0 px."
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.zeros(2))
+    apart, together, slipped = (
+        Hypothesis(name, f"It moved {when}", "Calibrate.", 33.0, 0.0, "px", 0.9, gain, (0, 1), (raw, 470.0, extra, 1.0))
+        for name, raw, extra, gain in (
+            ("camera_moved", 871.0, 19.0, 800.0), ("camera_moved", 796.0, 9.0, 740.0), ("tool_slipped", slip_gain, 6.0, 0.0))
+    )  # fmt: skip
+    found = verdicts.with_scene(Diagnosis((apart, together, slipped)), recording, np.arange(len(recording)))
+    assert found.best.name == named and found.best.gain == 800.0
+    assert len({h.name for h in found.hypotheses}) == len(found.hypotheses)
+
+
 @pytest.mark.parametrize(("scene_px", "named"), [(0.0, "frame_order"), (60.0, "camera_moved")])
 def test_a_scene_that_stands_still_clears_one_camera(decoded_once, monkeypatch, scene_px, named):
     recording = Recording.open(paths.SHIPPED_RECORDING)
