@@ -387,6 +387,8 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
         text = f"Images and robot disagree more and more, by {best.value:.1f} px from the first frame to the last."
         text += " The scene behind the tool stands still: the robot drifts, or the detector's error depends on the pose."
         cure = f"{_OVERLAYS}. If landmarks are marked beside the tool, {TRAIN_FURTHER}; else look for slack in the robot."
+        if np.ptp(frames) + 1 < len(recording):
+            cure = f"Check all frames first: a drift goes on, an error that depends on the pose comes and goes. {cure}"
         return Diagnosis((replace(best, name="robot_drifts", text=text, cure=cure), *others))
     when = best.text[best.text.index(" at about frame") :]
     if len(best.images) == 1:  # the other image and the robot agree

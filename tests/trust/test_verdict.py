@@ -330,6 +330,9 @@ def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_d
     drifting = replace(data, x_mm=data.x_mm + data.frame[:, None] / len(recording) * np.array([0.5, 0.3, 0.2]))
     (reason,) = (r for r in assess(recording, drifting).verdict.reasons if r.name == "robot_drifts")
     assert "disagree more and more, by" in reason.text and "cameras" not in reason.text
+    assert "Check all frames" not in reason.cure
+    some = assess(recording.showing(range(30)), drifting.of_frames(range(30))).verdict.reasons
+    assert any(r.name == "robot_drifts" and r.cure.startswith("Check all frames first") for r in some)
     monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
     names = [r.name for r in assess(recording, drifting).verdict.reasons]
     assert "drift" in names and "robot_drifts" not in names
