@@ -69,7 +69,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: Pixel noise that is assumed if the detections state none: that of labels set by hand.
 _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
-#: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
+#: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 3.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 _BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
@@ -182,7 +182,8 @@ def judge(
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
         if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for that
-            health = health.without_robot if len(best.images) == 2 else health.without_others
+            apart = len(best.images) == 1 or best.name == "exchanged_eyes"  # then the images of a pair contradict each other
+            health = health.without_others if apart else health.without_robot
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
@@ -378,7 +379,7 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
     first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
     moved_px = first.moved_px(last)[list(best.images)]  # NaN decides nothing
     others = [h for h in diagnosis.hypotheses if h.name != best.name]
-    still = (best.value > _NEARER_PX + _TIMES * moved_px).all()
+    still = (best.value > _NEARER_PX + _TIMES * moved_px).all() and (moved_px < _MOVED_PX).all()  # a turned image moves far
     if best.name == "tool_slipped":
         return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
     if not still:
