@@ -184,8 +184,9 @@ class Recording:
         span, logged, step = float(np.ptp(frame_s)), float(np.ptp(log_s)), np.diff(log_s)
         uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
         usual_s = float(np.median(step)) if len(step) else 0.0
-        reported = int(np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1).sum())
-        covered = int(((frame_s >= log_s[0]) & (frame_s <= log_s[-1])).sum())
+        reported = np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1)
+        covered = (frame_s >= log_s[0]) & (frame_s <= log_s[-1])
+        blank = covered & (np.interp(frame_s, log_s, np.isnan(self.kinematics.x_mm).any(axis=(1, 2))) > 0)  # on purpose
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
@@ -207,9 +208,9 @@ class Recording:
              "Set fps to the videos' rate, or if it varies, write the times of their frames to frames.csv (frame, time_s)."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
-            (reported / n < _COVERED, "little_overlap",
-             f"The robot reports a position in {reported} of {n} frames; {covered} lie between its first and last sample.",
-             "Check offset_s, fps and the time_s columns; export the log of the whole video, without gaps."),
+            ((reported | blank).mean() < _COVERED, "little_overlap",
+             f"The robot reports a position in {reported.sum()} of {n} frames; {covered.sum()} lie within its log.",
+             "Check offset_s, fps and the time_s columns; export the log of the whole video, with blank cells in its gaps."),
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),

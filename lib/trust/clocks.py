@@ -16,6 +16,8 @@ _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras 
 _WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
+#: The cure if one camera's images belong to other instants.
+PAIR_AGAIN = "Look for images that one camera lost, and pair left and right images of one instant."
 
 
 def _clock(case: Case) -> Iterator[Hypothesis]:
@@ -107,7 +109,7 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
 def _frame_order(case: Case) -> Iterator[Hypothesis]:
     """Frames that are lost or in a wrong order: each frame may belong to another instant near its stated one."""
     step = np.median(np.diff(np.sort(np.nanmin(case.by_frame(case.problem.time), axis=1))))
-    if case.frames < 8 or not 0 < step <= 0.25:
+    if case.frames < 8 or not step > 0:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # after lost frames most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
@@ -116,16 +118,18 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:
             continue  # images of this camera repeat; `frozen_video` tests that
         fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
-        others = 1e3 * shifts[own][np.abs(shifts[own]) > step / 2]
+        astray = np.abs(shifts[own]) > step / 2
+        others, first = 1e3 * shifts[own][astray], case.problem.number[astray.argmax()]
         if len(others) < 3:  # these may be spikes of the log
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"
         span = f"{low:+.0f} ms" if high - low < 1 else f"{low:+.0f} to {high:+.0f} ms"
-        text = f"{100 * share:.0f} % of the {what} belong to other instants, mostly {span} from those stated."
+        text = f"{100 * share:.0f} % of the {what} belong to other instants, mostly {span} from those stated"
+        text += f", first in frame {first}."
         cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
         if len(views) == 1:
-            cure = "Look for images that one camera lost, and pair left and right images of one instant."
+            cure = PAIR_AGAIN
         counts = np.bincount(own, minlength=len(shifts)) / case.frames
         penalty = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # entropy of the choices
         penalty += 0.5 * np.count_nonzero(counts) * np.log(case.frames)  # BIC of their frequencies

@@ -8,7 +8,7 @@ Its evidence is its gain in log likelihood minus a penalty for its parameters (B
 from collections import ChainMap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
 from scipy.ndimage import binary_opening, median_filter
@@ -30,7 +30,9 @@ _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and le
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, and `calibrate` corrects such offsets
 _LEAST_LENGTH_MM = 1.0  # larger than the error of any tool calibration
 _LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # lengths of the tool that are tried, if the robot's report lacks it
-_AS_GOOD = 6.0  # gain in log likelihood of moved cameras (16 numbers) over a slipped tool (3) that rules the latter out
+#: Gain in log likelihood of moved cameras (16 numbers), or of a jump (6), over a slipped tool (3) that rules the latter out.
+AS_GOOD = 6.0
+_SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (16 numbers) whose frames are examined
 _OPENED = 1.25  # a smaller factor may come from constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
 _BENDS = 1.5  # least motion of a bent tool's tips, as a multiple of the error that the detector states for the base
@@ -40,6 +42,8 @@ _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
 _MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
 _OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
+_UNITS = (1e3, 1e-3, 1e2, 1e-2, 1e1, 1e-1)  # ratios of units of length that are tried
+_ALIKE, _RIGID = 5.0, 0.1  # landmarks of a tool move as far within this factor, and stay apart within this share of it
 _STILL_PX, _STILL_MM = 0.3, 0.04  # detections in copies of one picture vary by less, and so does a robot at rest
 
 
@@ -219,20 +223,23 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     late = (problem.frame >= frame)[:, None]
     y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
     exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
-    number = problem.number[frame]  # in the recording
-    parts = f"--frames {problem.number[0]}:{number}, --frames {number}:{problem.number[-1] + 1}"
+    changes = both.total - case.null.total > _SURE_CHANGE  # else no hypothesis is named, and the search would take long
+    number, first, last = problem.number[[frame, *(problem.similar_cuts(frame, both) if changes else (frame, frame))]]
+    parts = f"--frames {problem.number[0]}:{first}, --frames {last}:{problem.number[-1] + 1}"
+    when = f"at about frame {number}" + (f" ({first} to {last})" if first < last else "")  # in the recording
     text = f"From about frame {number} on, the left image is the right one."
     cure = "Exchange the images of these frames between left/ and right/."
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
     yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
     slipped = problem.axes * late[..., None]
     fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
-    if fit.total > both.total - _AS_GOOD:
-        size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
-        text = f"The tool slipped at about frame {number}, by {size:.0f} um ({along} um in the tool's axes)."
-        cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
-        cure += "Where the tool does not turn, a robot whose zero changed looks the same."
-        yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
+    size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
+    text = f"The tool slipped {when}, by {size:.0f} um ({along} um in the tool's axes)."
+    cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
+    cure += "Where the tool does not turn, a robot whose zero changed looks the same."
+    slip = case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
+    # Ruled out, it only counts again if the scene stands still (`lib.trust.verdict.with_scene`).
+    yield slip if fit.total > both.total - AS_GOOD else replace(slip, gain=0.0)
     together = case.linear(problem.of_motion(late[:, 0]))
     for views, fit in (((0, 1), both), ((0, 1), together), ((0,), None), ((1,), None)):
         fit = fit or case.linear(problem.of_later_cameras(frame, views))
@@ -240,7 +247,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         how = "moved together" if fit is together else "moved or zoomed"
-        text = f"{who} {how} at about frame {number}: the images shift by {size:.1f} px."
+        text = f"{who} {how} {when}: the images shift by {size:.1f} px."
         cure = f"Calibrate the frames before and after separately ({parts}). "
         cure += "lib.registration.register_images can follow a move, but no zoom."
         cure += " A robot whose zero changed looks the same." * (len(views) == 2)
@@ -275,6 +282,17 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         yield certain("frozen_kinematics", fit, frozen, text, cure)
+    for k, name in enumerate(LANDMARKS):
+        still, moved_px = (sizes[1][:, k] < 1e-9) & (step_x > 1e-6), np.fmax(*(size[:, k] for size in sizes[2:]))
+        if still.mean() < 0.02:
+            continue
+        apart = np.isin(problem.frame, np.flatnonzero(still) + 1) & (problem.landmark == k)
+        fit = problem.fit(start=case.null.start, apart=apart)
+        wrong = still & (moved_px > 8 * fit.shapes[0].scale)
+        if wrong.mean() >= 0.02 and wrong.sum() > 0.5 * still.sum():  # else it rests, and some of its detections err
+            text = f"the robot's position of {name} alone stands still while it moves in the images"
+            cure = f"Log {name} at every sample; where its columns of kinematics.csv repeat an old position leave them blank."
+            yield certain("frozen_kinematics", fit, wrong, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
     far = [step > 8 * noise for step in steps]  # if one image repeats, the other shows whether the tool moved
@@ -347,6 +365,25 @@ def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_
     return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
 
 
+def _mixed_units(data: Correspondences) -> list[Hypothesis]:
+    """A landmark in another unit of length than the others: it keeps its distance from them only times a power of ten."""
+    x = data.grid("x_mm")[:, : len(LANDMARKS)]
+    x = x[np.isfinite(x).all(axis=(1, 2))]
+    moved = np.median(np.abs(x - np.median(x, axis=0)), axis=0).max(axis=1) if len(x) else np.zeros(x.shape[1])
+    for factor, k in product(_UNITS if moved.min() > 0 else (), range(x.shape[1])):
+        others = [j for j in range(x.shape[1]) if j != k]
+        if (np.abs(np.log(factor * moved[k] / moved[others])) > np.log(_ALIKE)).any():
+            continue
+        for other in others:
+            before, after = (np.linalg.norm(s * x[:, k] - x[:, other], axis=1).std() for s in (1.0, factor))
+            if after < _RIGID * moved[other] < before:
+                name = LANDMARKS[k]
+                text = f"The robot's positions of {name} have another unit than the others: times {factor:g} they fit them."
+                cure = f"Multiply the columns of {name} in kinematics.csv by {factor:g}, or state their unit in the mapping."
+                return [Hypothesis("mixed_units", text, cure, factor, 0.0, "times", 1.0, float(len(data)))]
+    return []
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """The hypotheses, most likely first."""
@@ -402,6 +439,11 @@ def diagnose(
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
+    if mixed := _mixed_units(data):
+        return Diagnosis((*mixed,))
+    if (problem.y[:, 0] == problem.y[:, 1])[problem.used.all(axis=1)].all(axis=1).mean() > 0.5:
+        text, cure = "Left and right images are the same.", "Put the right camera's own images into RECORDING."
+        return Diagnosis((Hypothesis("same_images", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
     if moved_px < _STILL_PX and moved_mm > _STILL_MM:

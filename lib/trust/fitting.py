@@ -33,6 +33,8 @@ _LEAST_ROBOT_MM, _TIMES = 0.03, 3.0  # a good robot errs by less than this, or t
 _NEARLY_SHUT, _SHUT_NOISE = 0.15, 3.0  # opening of nearly shut jaws, as a share of the tool's length; factor on their noise
 _LEAST_PX = 0.02  # smaller residuals are rounding errors
 _TRIAL_ROUNDS = 6  # rounds of a fit that only ranks candidate frames
+#: Loss of log likelihood that rules out another frame for a change: errors that depend on the pose made 18 of a true one.
+_SURE_CUT = 25.0
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # longest step between frames whose positions can replace the robot's log
 _PARAMETERS = 21  # two cameras with one distance (17), and about as many of the nine offsets as the data determine
@@ -212,6 +214,20 @@ class Problem:
             best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: cut_at(frame).total)
             step, cut = step if best != cut else step // 2, best
         return cut, self.fit(self.of_later_cameras(cut), start=cut_at(cut).start)
+
+    def similar_cuts(self, cut: int, best: Robust) -> tuple[int, int]:
+        """First and last frame around the likeliest `cut` at which the change of cameras in `best` may have come."""
+
+        def may_be(frame: int) -> bool:
+            other = self.fit(self.of_later_cameras(frame), start=best.start, rounds=_TRIAL_ROUNDS)
+            return best.total - other.total < _SURE_CUT
+
+        first, last = cut, cut
+        while first > 2 and may_be(first - 1):
+            first -= 1
+        while last < self.frame.max() - 1 and may_be(last + 1):
+            last += 1
+        return first, last
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
         """(..., n, 2, 2) px: the residuals with the cameras of a fit, if the landmarks were at positions x (..., n, 2, 3)."""

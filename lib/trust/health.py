@@ -87,12 +87,19 @@ class Health:
     @property
     def worst_part(self) -> str:
         """The part whose limit most landmarks exceed, without the parts of whole frames."""
-        return max((n for n in self.parts if n not in _OF_FRAMES), key=lambda name: np.sum(self.parts[name] > 1))
+        names = (name for name in self.parts if name not in _OF_FRAMES)
+        return max(names, key=lambda name: np.sum(self.parts[name] > 1), default="")
 
     @property
     def without_robot(self) -> Self:
         """The same without the parts that assume that the robot's report is right."""
         return replace(self, parts={name: part for name, part in self.parts.items() if name not in _BY_ROBOT})
+
+    @property
+    def without_others(self) -> Self:
+        """The same without the parts that assume that the robot's report and the other image are right."""
+        own = {name: part for name, part in self.parts.items() if name not in (*_BY_ROBOT, "epipolar")}
+        return replace(self, parts=own)
 
     @property
     def text(self) -> str:

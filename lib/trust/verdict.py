@@ -17,7 +17,9 @@ from lib.correspondences import FEWEST_TO_TRAIN, LANDMARKS, TRAIN_FURTHER, Corre
 from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
-from lib.trust.diagnosis import Diagnosis, diagnose, stated
+from lib.trust.clocks import PAIR_AGAIN
+from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
+from lib.trust.fitting import SIDES
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -67,10 +69,12 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: Pixel noise that is assumed if the detections state none: that of labels set by hand.
 _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
-#: nearer than the scene, but not by that much.  The tool has not slipped if the scene shifts by more than `_MOVED_PX`.
+#: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 _BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
+#: Causes of which a refused calibration says less, or something else.
+_KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
@@ -160,7 +164,10 @@ def judge(
         if name == "refused" or (name == "no_detection" and data is not None and data.is_by_hand):  # the error names its cure
             few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
             cure = _MORE_FRAMES if few else "Correct that, then check again."
-        found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
+        text = f"There is no calibration: {error}"
+        if best is not None and best.name in _KNOWS_BETTER:
+            text, cure = "There is no calibration.", "Correct what the diagnosis names, then check again."
+        found.append(Reason(name, LEVELS[2], text, cure))
     else:
         what = data, calibration, robot_accuracy_mm
         for finding in (*_residuals(*what), *_geometry(*what)):
@@ -174,8 +181,9 @@ def judge(
             cure = "Did a camera move, or were left and right not taken at the same instant? Calibrate again."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for robot errors
-            health = health.without_robot
+        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for that
+            apart = len(best.images) == 1 or best.name == "exchanged_eyes"  # then the images of a pair contradict each other
+            health = health.without_others if apart else health.without_robot
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
@@ -370,12 +378,13 @@ def assess(
 def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:
     """The diagnosis of some frames, corrected by the scene behind the tool, which moves only if a camera does."""
     best = diagnosis.best
-    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift") or len(best.images) < 2:
+    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift"):
         return diagnosis
     pairs = (recording.frames[int(i)] for i in (frames.min(), frames.max()))
     first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-    moved_px, others = first.moved_px(last), [h for h in diagnosis.hypotheses if h.name != best.name]  # NaN decides nothing
-    still = (best.value > _NEARER_PX + _TIMES * moved_px).all()
+    moved_px = first.moved_px(last)[list(best.images)]  # NaN decides nothing
+    others = [h for h in diagnosis.hypotheses if h.name != best.name]
+    still = (best.value > _NEARER_PX + _TIMES * moved_px).all() and (moved_px < _MOVED_PX).all()  # a turned image moves far
     if best.name == "tool_slipped":
         return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
     if not still:
@@ -384,9 +393,19 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
         text = f"Images and robot disagree more and more, by {best.value:.1f} px from the first frame to the last."
         text += " The scene behind the tool stands still: the robot drifts, or the detector's error depends on the pose."
         cure = f"{_OVERLAYS}. If landmarks are marked beside the tool, {TRAIN_FURTHER}; else look for slack in the robot."
+        if np.ptp(frames) + 1 < len(recording):
+            cure = f"Check all frames first: a drift goes on, an error that depends on the pose comes and goes. {cure}"
         return Diagnosis((replace(best, name="robot_drifts", text=text, cure=cure), *others))
-    text = "Images and robot disagree" + best.text[best.text.index(" at about frame") :]
-    text += " The scene behind the tool stands still, so the robot's report jumped."
+    when = best.text[best.text.index(" at about frame") :]
+    if len(best.images) == 1:  # the other image and the robot agree
+        text = f"The {SIDES[best.images[0]]} images disagree with the robot{when.replace(' at', ' from', 1)}"
+        text += " The scene behind the tool stands still, so they belong to other instants, or the detector errs in them."
+        return Diagnosis((replace(best, name="frame_order", text=text, cure=PAIR_AGAIN), *others))
+    jump = min((h for h in diagnosis.hypotheses if h.name == best.name), key=lambda h: h.evidence[2])  # of fewest parameters
+    slip = next((h for h in others if h.name == "tool_slipped"), None)
+    if slip and slip.evidence[0] > jump.evidence[0] - AS_GOOD:
+        return Diagnosis((replace(slip, gain=best.gain), *(h for h in others if h is not slip)))
+    text = f"Images and robot disagree{when} The scene behind the tool stands still, so the robot's report jumped."
     return Diagnosis((replace(best, name="robot_jumped", text=text, cure=best.cure.split(". ")[0] + "."), *others))
 
 

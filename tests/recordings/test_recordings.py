@@ -699,6 +699,18 @@ def test_doubts(frames, times, jump, name):
     assert bool(recording.mistimed) == (name not in (None, "jump"))
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_cells_that_are_left_blank_where_the_robot_was_silent_are_no_doubt(named):
+    """The cure of a log that stood still for a while; samples that are missing are doubted."""
+    times = np.arange(-0.1, 2, 0.01)
+    silent = (times > 0.4) & (times < 1.2)
+    log = Kinematics(times, np.where(silent[:, None, None], np.nan, np.zeros((len(times), 3, 3))))
+    log = Kinematics(times[~silent], log.x_mm[~silent]) if named else log
+    at = Frames(None, None, np.arange(40) / 25)
+    recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
+    assert [doubt.name for doubt in recording.doubts] == ["little_overlap"] * named
+
+
 @pytest.mark.parametrize(("held", "grid_mm", "named"), [(5, 0.0, True), (1, 0.0, False), (1, 0.02, False), (1, 0.5, True)])
 def test_a_log_that_repeats_its_positions_is_in_doubt(held, grid_mm, named):
     """A slow robot and a fast logger, or a coarse grid; a fine one does no harm.  Rests count little."""

@@ -47,6 +47,17 @@ def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
     assert best.name == "camera_moved" and "zoomed at about frame 20" in best.text and "no zoom" in best.cure
 
 
+def test_frames_that_may_belong_to_either_side_of_a_small_zoom_are_left_out():
+    scene = take()
+    data, centre = scene.data, (np.array(scene.image_size_px) - 1) / 2
+    zoom = np.where(data.frame >= 20, 1.018, 1.0)[:, None]
+    left, right = (centre + zoom * (u - centre) for u in (data.u_left, data.u_right))
+    best = found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+    first, last = map(int, re.search(r"at about frame \d+ \((\d+) to (\d+)\)", best.text).groups())
+    assert first < last and first <= 20 <= last
+    assert f"(--frames 0:{first}, --frames {last}:40)" in best.cure
+
+
 def test_a_microscope_that_moves_as_a_whole_needs_six_numbers():
     spoiled = take("camera moved", "0.3 degrees", seed=8)
     first, second = [h for h in found(spoiled).hypotheses if h.name == "camera_moved" and len(h.images) == 2]
@@ -439,6 +450,55 @@ def test_images_that_agree_accuse_no_detector():
         usual.data.time_s + usual.offset_s + late_s, usual.data.landmark, strict=True)])  # fmt: skip
     best = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).best
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
+
+
+@pytest.mark.parametrize(("landmark", "factor"), [(0, 1000.0), (2, 1000.0), (1, 0.1), (2, 0.001)])
+def test_a_landmark_in_another_unit_than_the_others_is_named(landmark, factor):
+    usual = take()
+    own = (usual.data.landmark == landmark)[:, None]
+    x_mm = np.where(own, (usual.data.x_mm + [30.0, -20.0, 50.0]) / factor, usual.data.x_mm + [30.0, -20.0, 50.0])
+    (named,) = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).hypotheses
+    name = ("base", "tip_1", "tip_2")[landmark]
+    assert named.name == "mixed_units" and named.value == factor and f"columns of {name} in kin" in named.cure
+
+
+def test_a_base_that_hardly_moves_is_in_the_unit_of_the_tips():
+    """As where the tool turns about the incision."""
+    usual = take()
+    x = usual.data.x_mm.reshape(-1, 3, 3)
+    still = x - x[:, :1] + np.array([30.0, -20.0, 50.0]) + 0.01 * x[:, :1]
+    named = found(replace(usual, data=replace(usual.data, x_mm=still.reshape(-1, 3)))).hypotheses
+    assert "mixed_units" not in [h.name for h in named]
+
+
+def test_copies_of_one_camera_are_named():
+    usual = take()
+    (named,) = found(replace(usual, data=replace(usual.data, u_right=usual.data.u_left))).hypotheses
+    assert named.name == "same_images" and "the right camera's own images into RECORDING" in named.cure
+
+
+def test_a_log_that_repeats_one_landmark_alone_accuses_this_landmark():
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0)
+
+    def stuck(scene, t, x):
+        held = x.copy()
+        held[(t > 0.8) & (t < 1.6), 1] = x[np.searchsorted(t, 0.8), 1]
+        return held
+
+    scene.edit_report.append(stuck)
+    best = found(scene.take()).best
+    assert best.name == "frozen_kinematics" and best.value == pytest.approx(30, abs=6)
+    assert "position of tip_1 alone stands still" in best.text and "leave them blank" in best.cure
+
+
+def test_a_camera_that_lost_an_image_of_a_slow_video_did_not_move():
+    """From frame 20 on, each right image is the next one."""
+    usual = take(fps=2.5)
+    right = usual.data.u_right.reshape(-1, 3, 2)
+    right = right[np.minimum(np.arange(40) + (np.arange(40) >= 20), 39)].reshape(-1, 2)
+    best = found(replace(usual, data=replace(usual.data, u_right=right))).best
+    assert best.name == "frame_order" and best.images == (1,)
+    assert "right images belong to other instants, mostly +400 ms from those stated, first in frame 20." in best.text
 
 
 @pytest.mark.parametrize(("frames", "kept"), [(100, 60), (200, 60), (100, 95)])

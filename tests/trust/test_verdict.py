@@ -178,6 +178,13 @@ def test_a_refusal_names_its_own_cure():
     assert "cover a few depths as well" in reason.text
 
 
+def test_a_refusal_does_not_contradict_the_diagnosis():
+    cause = Hypothesis("mirrored_axis", "An axis is mirrored.", "Negate one.", 11.0, 0.1, "degrees", 1.0, 100.0)
+    verdict = judge(None, None, diagnosis=Diagnosis((cause,)), error=DataError("exchange left and right."))
+    assert [reason.name for reason in verdict.reasons] == ["mirrored_axis", "refused"]
+    assert "exchange" not in str(verdict)
+
+
 @pytest.fixture(scope="module")
 def decoded_once():
     """The images of the recording that ships."""
@@ -289,12 +296,51 @@ def test_a_scene_that_stands_still_tells_a_jump_of_the_log_from_moved_cameras(de
     assert "camera_moved" in names and "robot_jumped" not in names
 
 
+@pytest.mark.parametrize(("slip_gain", "named"), [(850.0, "tool_slipped"), (770.0, "robot_jumped")])
+def test_where_the_scene_stands_still_a_slipped_tool_competes_with_a_jump_only(monkeypatch, decoded_once, slip_gain, named):
+    """Sixteen numbers of cameras that did not move explain some of the detector's errors, too."""
+    recording, when = Recording.open(paths.SHIPPED_RECORDING), "at about frame 20: the images shift by 33.0 px."
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.zeros(2))
+    apart, together, slipped = (
+        Hypothesis(name, f"It moved {when}", "Calibrate.", 33.0, 0.0, "px", 0.9, gain, (0, 1), (raw, 470.0, extra, 1.0))
+        for name, raw, extra, gain in (
+            ("camera_moved", 871.0, 19.0, 800.0), ("camera_moved", 796.0, 9.0, 740.0), ("tool_slipped", slip_gain, 6.0, 0.0))
+    )  # fmt: skip
+    found = verdicts.with_scene(Diagnosis((apart, together, slipped)), recording, np.arange(len(recording)))
+    assert found.best.name == named and found.best.gain == 800.0
+    assert len({h.name for h in found.hypotheses}) == len(found.hypotheses)
+
+
+@pytest.mark.parametrize(("scene_px", "named"), [(0.0, "frame_order"), (20.0, "camera_moved")])
+def test_a_scene_that_stands_still_clears_one_camera(decoded_once, monkeypatch, scene_px, named):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, scene_px]))
+    moved = Hypothesis("camera_moved", "The right camera moved or zoomed at about frame 20: the images shift by 77.0 px.",
+                       "Calibrate.", 77.0, 0.0, "px", explained=0.6, gain=40.0, images=(1,))  # fmt: skip
+    best = verdicts.with_scene(Diagnosis((moved,)), recording, np.arange(len(recording))).best
+    assert best.name == named
+    assert scene_px or "The right images disagree with the robot from about frame 20: the images shift by 77" in best.text
+
+
+def test_what_one_image_explains_accuses_no_detector():
+    """The images of a pair then disagree, whatever the detector does."""
+    apart = Health(np.arange(20), {"epipolar": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
+    late = Hypothesis("frame_order", "Late.", "Pair them.", 50.0, 0.0, "%", explained=0.9, gain=100.0, images=(1,))
+    for images, accused in (((1,), False), ((0, 1), True)):
+        diagnosis = Diagnosis((replace(late, images=images),))
+        verdict = judge(None, None, diagnosis=diagnosis, health=apart, error=DataError("no."))
+        assert ("detector_unfit" in [reason.name for reason in verdict.reasons]) == accused
+
+
 def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_do(decoded_once, monkeypatch):
     recording = Recording.open(paths.SHIPPED_RECORDING)
     data = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
     drifting = replace(data, x_mm=data.x_mm + data.frame[:, None] / len(recording) * np.array([0.5, 0.3, 0.2]))
     (reason,) = (r for r in assess(recording, drifting).verdict.reasons if r.name == "robot_drifts")
     assert "disagree more and more, by" in reason.text and "cameras" not in reason.text
+    assert "Check all frames" not in reason.cure
+    some = assess(recording.showing(range(30)), drifting.of_frames(range(30))).verdict.reasons
+    assert any(r.name == "robot_drifts" and r.cure.startswith("Check all frames first") for r in some)
     monkeypatch.setattr(Scene, "moved_px", lambda *_: np.array([60.0, 60.0]))
     names = [r.name for r in assess(recording, drifting).verdict.reasons]
     assert "drift" in names and "robot_drifts" not in names
