@@ -67,7 +67,7 @@ class Correspondences:
         n = len(np.atleast_1d(self.frame))
         for name, tail in _SHAPES.items():
             given, whole = np.asarray(getattr(self, name)), name in ("frame", "landmark")
-            if whole and (given != np.rint(given)).any():
+            if whole and not (np.isfinite(given) & (given == np.rint(given))).all():
                 raise ValueError(f"{name}: expected whole numbers, one for each row; times belong into time_s.")
             if name == "landmark" and given.min(initial=0) < 0:
                 raise ValueError(f"landmark: must not be negative, got {given.min()}; leave rows of unknown landmarks out.")
