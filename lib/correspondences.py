@@ -66,12 +66,12 @@ class Correspondences:
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.frame))
         for name, tail in _SHAPES.items():
-            given, number = np.asarray(getattr(self, name)), name in ("frame", "landmark")
-            if number and (given.astype(np.int64) != given).any():
+            given, whole = np.asarray(getattr(self, name)), name in ("frame", "landmark")
+            if whole and not (np.isfinite(given) & (given == np.rint(given))).all():
                 raise ValueError(f"{name}: expected whole numbers, one for each row; times belong into time_s.")
             if name == "landmark" and given.min(initial=0) < 0:
                 raise ValueError(f"landmark: must not be negative, got {given.min()}; leave rows of unknown landmarks out.")
-            array = np.asarray(given, dtype=np.int64 if number else np.float64)
+            array = np.asarray(given, dtype=np.int64 if whole else np.float64)
             if array.shape != (n, *tail):
                 raise ValueError(f"{name}: expected {(n, *tail)}, got {array.shape}.")
             object.__setattr__(self, name, array)

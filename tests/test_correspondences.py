@@ -138,6 +138,8 @@ def test_wrong_shapes_are_named():
     ("change", "text"),
     [
         ({"frame": [0.0, 0.04]}, "frame: expected whole numbers.*time_s"),
+        ({"frame": [0.0, np.nan]}, "frame: expected whole numbers"),
+        ({"landmark": [0.0, np.inf]}, "landmark: expected whole numbers"),
         ({"landmark": [0, -1]}, "landmark: must not be negative"),
     ],
 )

@@ -371,13 +371,17 @@ def test_wrong_labels_come_before_the_noise_that_they_make(small):
     red, health = trust.LEVELS[-1], trust.Health(np.arange(6), parts, np.ones((6, 3), dtype=bool))
     reasons = (trust.Reason("robot_noise", red, "Noise.", "Check."), trust.Reason("minority", red, "Few.", "Look again."))
     found = SimpleNamespace(
-        verdict=trust.Verdict(reasons), diagnosis=SimpleNamespace(best=SimpleNamespace(name="robot_noise")),
+        verdict=trust.Verdict(reasons), diagnosis=SimpleNamespace(best=SimpleNamespace(name="robot_noise", images=(0, 1))),
         health=health, calibration=None,
     )  # fmt: skip
     answers, bad, _ = verdicts.in_words(Recording.open(small), found, None)
     assert answers["Then what?"] == "Look again." and bad == 6
     answers, bad, note = verdicts.in_words(Recording.open(small), found, "Check.")
     assert answers["Then what?"] == "Noise. Check." and bad == 0 and "another cause" in note
+    parts["epipolar"][:] = 2.0
+    for found.diagnosis.best.images, n_bad in (((0, 1), 6), ((1,), 0)):  # where one image errs, the pair disagrees anyway
+        assert verdicts.in_words(Recording.open(small), found, "Check.")[1] == n_bad
+    parts["epipolar"][:] = 0.5
     amber = trust.Reason("base", trust.LEVELS[1], "The base is off.", "Look.")
     found = SimpleNamespace(verdict=trust.Verdict((amber,)), diagnosis=trust.Diagnosis(), health=health, calibration=None)
     answers, _, _ = verdicts.in_words(Recording.open(small), found, "Check.")

@@ -121,8 +121,8 @@ def calibrate(
         found = estimate(axes=axes)
         if axes is not None:
             found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
-    for rows in found.view_inliers.T if checks else ():  # again, with the noise of this robot
-        refuse.check_spread(found.x_mm[rows], found.sigma_x_mm)
+    for chosen in found.view_inliers.T if checks else ():  # again, with the noise of this robot
+        refuse.check_spread(found.x_mm[chosen], found.sigma_x_mm)
     if usable is None:
         return found
     # Insert the rows that are not usable, so that the results have one entry for each row of the data.

@@ -156,6 +156,7 @@ def tool_offsets(
     solution = np.linalg.lstsq(np.hstack([t / scale, np.ones((len(t), 1)), lifted]), pixels, rcond=1e-6)[0]
     A, B = solution[:3].T, solution[4:].reshape(q, 3, 3, -1)  # B: vector, row of R (with A), column (with p), pixel
     offset = np.einsum("kijm,mi->kj", B, A) / (A**2).sum() * scale
+
     def evaluate(offset: np.ndarray) -> tuple[float, tuple[np.ndarray, ...]]:
         """Energy; points, cameras and residuals.  The weights are the same for all rows, so they change no camera."""
         x = np.einsum("nij,nj->ni", R, own @ offset) + t

@@ -115,8 +115,8 @@ def estimate_time_offset(
     A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no
     cameras (`NoConsensusError`), and an offset at the edge of the search.
     """
-    if not search_s > 0:
-        raise ValueError(f"search_s: half the width of the search must be positive, got {search_s}.")
+    if not 0 < search_s < np.inf:
+        raise ValueError(f"search_s: half the width of the search must be positive and finite, got {search_s}.")
     time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics)
     if landmark.max(initial=0) >= len(paths.pieces):

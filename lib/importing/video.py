@@ -171,19 +171,13 @@ class StereoSource:
             turns = self.video.rotate_left, self.video.rotate_right
             images = images[::-1] if self.video.exchanged else images
             left, right = (np.rot90(image, -turn // 90) for image, turn in zip(images, turns, strict=True))
-            if any(turns):
-                left, right = _padded(left, right)
-            if left.shape != right.shape:
+            if left.shape != right.shape and not (any(turns) and sorted(left.shape) == sorted(right.shape)):
                 what = f"left and right frames differ in size ({' and '.join(sizes)})"
                 cure = "export both alike. If one camera is turned, set video.rotate_left or video.rotate_right"
                 raise ValueError(f"{places[-1]}: {what}; {cure}.")
-            yield left, right
-
-
-def _padded(*images: np.ndarray) -> Iterator[np.ndarray]:
-    """The images with black at the right and at the bottom, where pixels keep their coordinates, up to a common size."""
-    height, width = np.max([image.shape[:2] for image in images], axis=0)
-    return (np.pad(i, ((0, height - i.shape[0]), (0, width - i.shape[1]), (0, 0))) for i in images)
+            # Black at the right and at the bottom makes sizes equal; there, pixels keep their coordinates.
+            size = np.maximum(left.shape, right.shape)
+            yield tuple(np.pad(i, [(0, more) for more in size - i.shape]) if any(turns) else i for i in (left, right))
 
 
 def open_stereo(folder: Path, video: Video) -> StereoSource:

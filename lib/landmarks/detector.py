@@ -245,7 +245,7 @@ class Detector:
         detector then first looks at the difference from them.  Raises ValueError for another shape, type or range.
         """
         images = as_uint8(images)
-        if batch not in range(1, 1 << 30):
+        if batch < 1 or batch % 1:
             raise ValueError(f"batch: expected a number of images, 1 or more, got {batch}.")
         with self._threads():
             parts = (slice(start, start + batch) for start in range(0, len(images), batch))

@@ -213,7 +213,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     in_x, in_y = ([np.flatnonzero(index == i) for i in range(index[0], index[-1] + 1)] for index in (bin_x, bin_y))
     bins = volume.new_full((gy + len(in_y) - 1, gx + len(in_x) - 1), -torch.inf)
     best, rival, flat = *volume.new_empty(2, gy, gx), torch.empty(gy, gx, dtype=torch.long)
-    own_x = torch.from_numpy(bin_x - bin_x[0])
+    own_x, x_of_bins = torch.from_numpy(bin_x - bin_x[0]), torch.arange(len(in_x))[:, None, None]
 
     def search(top: int) -> list[list[torch.Tensor]]:
         """Find the best displacements of a chunk of lattice rows; returns the largest scores (chunk, gx) for each bin."""
@@ -221,10 +221,9 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
         score = unpool(volume[part], scores[part], v % 2)
         torch.max(score.flatten(2), dim=2, out=(best[part], flat[part]))
         strongest = [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
-        elsewhere = torch.stack([torch.stack(row) for row in strongest]).amax(dim=0)
-        for x, own in enumerate(elsewhere):  # the bin of the match and those next to it are no rivals
-            own.masked_fill_((own_x[flat[part] % n] - x).abs() <= 1, 0.0)
-        torch.amax(elsewhere, dim=0, out=rival[part])
+        near = (own_x[flat[part] % n] - x_of_bins).abs() <= 1  # the bin of the match and those next to it are no rivals
+        rivals = torch.stack([torch.stack(row) for row in strongest]).amax(dim=0).masked_fill_(near, 0.0)
+        torch.amax(rivals, dim=0, out=rival[part])
         return strongest
 
     tops = range(0, gy, ROWS)

@@ -34,11 +34,11 @@ _FREEDOM = 4.0  # degrees of freedom of Student's t for landmarks about the fram
 class DriftMonitor:
     """CUSUM tests (Page 1954) on the residuals r = u - rig.project(x), for each axis of `AXES` and each sign.
 
-    The detector's error is biased and correlated in time, and its stated noise may be wrong. So the bias is estimated as a
-    slow mean of the residuals, within half a pixel, and the noise as their long-run standard deviation. It allows for
-    correlation over ten frames, laterally over more; errors in depth that last longer raise more false alarms. The score z
-    is the residual minus the bias, divided by the noise. Each frame adds to a sum S the log likelihood ratio between the
-    shift to be detected and none. The alarm level gives a false alarm every `_FRAMES` frames (Siegmund 1985). The initial
+    The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is estimated as a
+    slow mean of the residuals, within half a pixel, and the noise as their long-run standard deviation.  It allows for
+    correlation over ten frames, laterally over more; errors in depth that last longer raise more false alarms.  The score z
+    is the residual minus the bias, divided by the noise.  Each frame adds to a sum S the log likelihood ratio between the
+    shift to be detected and none.  The alarm level gives a false alarm every `_FRAMES` frames (Siegmund 1985).  The initial
     noise is `covariance_px2` of (u_left, u_right), a number, (2, 2) or (4, 4) px^2, and `sigma_x_mm` of the robot's report,
     per coordinate.
 

@@ -237,7 +237,7 @@ def fit_surface(
         x_mm: (n, 3) points, mm.
         domain: (x0, y0, x1, y1) px that the surface covers.
         control: (n_x, n_y) control points.
-        smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points, whatever their order.
+        smoothness: mu, 0 to 1e18 px^2 / mm.  None chooses it by the mean L1 error of held-out points, whatever their order.
         reject_mm: Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the
             first fit, or more if too few points would remain; infinity keeps all.
         covariance_mm2: Covariance of the points, (3, 3) or (n, 3, 3).  Residuals are then taken along the principal axes of

@@ -135,7 +135,9 @@ def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np
         found = np.linalg.lstsq(information, weighted.T @ target, rcond=1e-12)[0]
         residual = target - design @ found
         scale = max(1.4826 * np.median(np.abs(residual)), 1.0)  # not below the matches' stated noise
-        weight = 1 / (1 + (residual / (_SOFT * scale)) ** 2) ** 2
+        before, weight = weight, 1 / (1 + (residual / (_SOFT * scale)) ** 2) ** 2
+        if np.abs(weight - before).max() < 1e-4:  # mostly after 7 rounds
+            break
     return found, information / (_CORRELATED * scale**2)
 
 

@@ -371,16 +371,13 @@ def _mixed_units(data: Correspondences) -> list[Hypothesis]:
     x = x[np.isfinite(x).all(axis=(1, 2))]
     moved = np.median(np.abs(x - np.median(x, axis=0)), axis=0).max(axis=1) if len(x) else np.zeros(x.shape[1])
     for factor, k in product(_UNITS if moved.min() > 0 else (), range(x.shape[1])):
-        others = [j for j in range(x.shape[1]) if j != k]
-        if (np.abs(np.log(factor * moved[k] / moved[others])) > np.log(_ALIKE)).any():
-            continue
-        for other in others:
-            before, after = (np.linalg.norm(s * x[:, k] - x[:, other], axis=1).std() for s in (1.0, factor))
-            if after < _RIGID * moved[other] < before:
-                name = LANDMARKS[k]
-                text = f"The robot's positions of {name} have another unit than the others: times {factor:g} they fit them."
-                cure = f"Multiply the columns of {name} in kinematics.csv by {factor:g}, or state their unit in the mapping."
-                return [Hypothesis("mixed_units", text, cure, factor, 0.0, "times", 1.0, float(len(data)))]
+        name, others = LANDMARKS[k], np.arange(x.shape[1]) != k
+        alike = np.abs(np.log(factor * moved[k] / moved[others])) <= np.log(_ALIKE)
+        before, after = (np.linalg.norm(s * x[:, [k]] - x[:, others], axis=2).std(axis=0) for s in (1.0, factor))
+        if alike.all() and ((after < _RIGID * moved[others]) & (before > _RIGID * moved[others])).any():
+            text = f"The robot's positions of {name} have another unit than the others: times {factor:g} they fit them."
+            cure = f"Multiply the columns of {name} in kinematics.csv by {factor:g}, or state their unit in the mapping."
+            return [Hypothesis("mixed_units", text, cure, factor, 0.0, "times", 1.0, float(len(data)))]
     return []
 
 

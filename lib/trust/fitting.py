@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import takewhile
 from typing import Self
 
 import numpy as np
@@ -222,12 +223,8 @@ class Problem:
             other = self.fit(self.of_later_cameras(frame), start=best.start, rounds=_TRIAL_ROUNDS)
             return best.total - other.total < _SURE_CUT
 
-        first, last = cut, cut
-        while first > 2 and may_be(first - 1):
-            first -= 1
-        while last < self.frame.max() - 1 and may_be(last + 1):
-            last += 1
-        return first, last
+        earlier, later = range(cut - 1, 1, -1), range(cut + 1, int(self.frame.max()))
+        return tuple([cut, *takewhile(may_be, frames)][-1] for frames in (earlier, later))
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
         """(..., n, 2, 2) px: the residuals with the cameras of a fit, if the landmarks were at positions x (..., n, 2, 3)."""

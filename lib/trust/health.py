@@ -18,6 +18,7 @@ from lib.calibration import Calibration, with_offsets
 from lib.correspondences import Correspondences
 from lib.landmarks import with_ground
 from lib.recordings import Recording
+from lib.trust.fitting import Hypothesis
 
 #: Part of the score -> limit for a landmark of a frame; see `Health.false_alarm_rate`.
 LIMITS = {
@@ -72,7 +73,7 @@ class Health:
     @property
     def score(self) -> np.ndarray:
         """(m,) the worst part of the worst landmark; above 1 the frame is in doubt; NaN where no part could be computed."""
-        return np.fmax.reduce([np.fmax.reduce(part, axis=1) for part in self.parts.values()])
+        return np.fmax.reduce([np.full(len(self.frame), np.nan), *(np.fmax.reduce(p, axis=1) for p in self.parts.values())])
 
     @property
     def bad(self) -> np.ndarray:
@@ -90,16 +91,11 @@ class Health:
         names = (name for name in self.parts if name not in _OF_FRAMES)
         return max(names, key=lambda name: np.sum(self.parts[name] > 1), default="")
 
-    @property
-    def without_robot(self) -> Self:
-        """The same without the parts that assume that the robot's report is right."""
-        return replace(self, parts={name: part for name, part in self.parts.items() if name not in _BY_ROBOT})
-
-    @property
-    def without_others(self) -> Self:
-        """The same without the parts that assume that the robot's report and the other image are right."""
-        own = {name: part for name, part in self.parts.items() if name not in (*_BY_ROBOT, "epipolar")}
-        return replace(self, parts=own)
+    def beside(self, cause: Hypothesis) -> Self:
+        """The same without the parts that another cause than the detector spoils: it is not to blame for them."""
+        apart = len(cause.images) == 1 or cause.name == "exchanged_eyes"  # then the images of a pair contradict each other
+        spoilt = (*_BY_ROBOT, "epipolar") if apart else _BY_ROBOT
+        return replace(self, parts={name: part for name, part in self.parts.items() if name not in spoilt})
 
     @property
     def text(self) -> str:

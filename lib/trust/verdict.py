@@ -181,9 +181,8 @@ def judge(
             cure = "Did a camera move, or were left and right not taken at the same instant? Calibrate again."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        if best is not None and best.name not in OF_DETECTOR:  # then the detector is not blamed for that
-            apart = len(best.images) == 1 or best.name == "exchanged_eyes"  # then the images of a pair contradict each other
-            health = health.without_others if apart else health.without_robot
+        if best is not None and best.name not in OF_DETECTOR:
+            health = health.beside(best)
         text = health.text + f" (most often: {health.worst_part})" * bool(health.seen.any()) + "."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
@@ -384,10 +383,9 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
     first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
     moved_px = first.moved_px(last)[list(best.images)]  # NaN decides nothing
     others = [h for h in diagnosis.hypotheses if h.name != best.name]
-    still = (best.value > _NEARER_PX + _TIMES * moved_px).all() and (moved_px < _MOVED_PX).all()  # a turned image moves far
     if best.name == "tool_slipped":
         return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
-    if not still:
+    if not ((best.value > _NEARER_PX + _TIMES * moved_px) & (moved_px < _MOVED_PX)).all():  # a turned image moves far
         return diagnosis
     if best.name == "drift":
         text = f"Images and robot disagree more and more, by {best.value:.1f} px from the first frame to the last."

@@ -96,9 +96,9 @@ def in_words(
     vague = ("detector_unfit",) if next_step else ("detector_unfit", "robot_noise")  # wrong labels look like noise, too
     named = cause is not None and cause.name in reasons and cause.name not in vague
     frames, note = len(health.frame), f"of {len(health.frame)}: score above 1"
-    if named and cause.name not in OF_DETECTOR:  # then contradictions with the robot are not the detector's fault
-        health = health.without_robot
-        note += " without the comparison with the robot, since another cause is named"
+    if named and cause.name not in OF_DETECTOR:
+        health = health.beside(cause)
+        note += " without the comparisons that another cause spoils"
     missed = np.zeros(frames, dtype=bool)
     if next_step:  # frames without labels are not bad
         missed, note = ~health.seen.any(axis=1), f"{note}, or no landmark found"

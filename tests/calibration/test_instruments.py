@@ -154,8 +154,9 @@ def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
 
 def test_time_offset_at_the_edge_of_its_search_is_refused_with_the_cure():
     frames, robot = video(0.5, 0)
-    with pytest.raises(ValueError, match="search_s: half the width of the search must be positive"):
-        estimate_time_offset(frames, robot, search_s=-1)
+    for search_s in (-1, np.inf):
+        with pytest.raises(ValueError, match="search_s: half the width of the search must be positive and finite"):
+            estimate_time_offset(frames, robot, search_s=search_s)
     with pytest.raises(ValueError, match="^search_s: the search ends at its upper edge; widen search_s.$"):
         estimate_time_offset(frames, robot)
     assert estimate_time_offset(frames, robot, search_s=0.7).offset_s == pytest.approx(0.5, abs=1e-3)

@@ -87,6 +87,10 @@ def test_images_of_a_turned_camera_are_turned_back(tmp_path, shipped):
             height, width = own.shape[:2]
             assert image.shape == tuple(size) and (image[:height, :width] == own).all()
             assert not image[height:].any() and not image[:, width:].any()
+    for path in (folder / "cam R").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path))[:-20])
+    with pytest.raises(ValueError, match="differ in size"):  # turned or not, these are no images of one pair
+        import_recording(folder, mapping, tmp_path / "refused")
     mapping.write_text(f"{mapping.read_text('utf-8')}[labels]\nkind = 'coco'\nfile = 'labels.json'\n", "utf-8")
     with pytest.raises(ValueError, match="labels of images that are to be turned are not read"):
         read_mapping(mapping)
