@@ -314,7 +314,7 @@ def test_notebook_7_says_what_to_do_on_a_red_verdict(small, monkeypatch, capsys)
 def answers_of_notebook_7(small, monkeypatch, capsys, *reasons, cause=None, **parameters):
     """What notebook 7 answers in words where the verdict has these reasons: (name, level, text, cure)."""
     told = trust.Verdict(tuple(trust.Reason(*reason) for reason in reasons))
-    found = None if cause is None else SimpleNamespace(name=cause, text="The cause.", cure="Mend the cause.")
+    found = None if cause is None else SimpleNamespace(name=cause, images=(0, 1), text="The cause.", cure="Mend the cause.")
     assess, diagnosis = check.assess, SimpleNamespace(best=found, hypotheses=())
     monkeypatch.setattr(
         check, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=told, diagnosis=diagnosis)
