@@ -46,7 +46,7 @@ class Calibration:
         minimum: The fit to the inliers.
         parameter_covariance: (p, p) covariance of the model's parameters.
         view_inliers: (n, cameras) bool: the views used, one row for each row of the data.
-        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; sigma_u_px is the RMS of `covariance_px2`.
+        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; with `covariance_px2`, sigma_u_px is its `noise_rms_px`.
         model, weighting, image_size_px: As given to `calibrate`.
         x_mm, y_px, residuals_px: (n, 3), (n, m) and y - project(x), m = 2 per camera, with the offsets applied.  Residuals
             contain the robot's errors.  NaN in unusable rows: a landmark is missing, or a tool with shut jaws has no axes.

@@ -94,10 +94,10 @@ def main(argv: list[str] | None = None) -> int:
             near = "; the cameras have a finite distance" if np.isfinite(result.working_distance_mm) else ""
             if (now := result.state + f": {result.cause}" * bool(result.cause) + near) != state:
                 state = now
-                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {now}")
+                print(f"frame {arrival.source:6d} {result.time_s:9.2f} s: {now}")
             for name, why in result.failures.items():
                 if why != said.get(name) and why not in result.cause:
-                    print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
+                    print(f"frame {arrival.source:6d} {name}: {why}", file=sys.stderr)
             said = result.failures
             if recorder:
                 recorder.add(arrival, result)

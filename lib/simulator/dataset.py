@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--overwrite", action="store_true", help="--rung: replace the recording of the folder")
     only = parser.add_mutually_exclusive_group().add_argument
     only("--dry-run", action="store_true", help="only print the time and the disk space that the data set takes")
-    only("--shipped", action="store_true", help="make data/open_sky_eye anew instead, in the light of this version")
+    only("--shipped", action="store_true", help="make data/open_sky_eye instead, rightly shaded; takes no other option")
     only("--rung", choices=("near", "validation", *FAR), help="make one recording with this shift instead")
     arguments = parser.parse_args(argv)
     given = {name for name, value in vars(arguments).items() if value != parser.get_default(name)}

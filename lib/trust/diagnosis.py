@@ -437,7 +437,7 @@ def diagnose(
         unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
     if mixed := _mixed_units(data):
-        return Diagnosis((*mixed,))
+        return Diagnosis(tuple(mixed))
     if (problem.y[:, 0] == problem.y[:, 1])[problem.used.all(axis=1)].all(axis=1).mean() > 0.5:
         text, cure = "Left and right images are the same.", "Put the right camera's own images into RECORDING."
         return Diagnosis((Hypothesis("same_images", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))

@@ -38,21 +38,21 @@ def test_a_good_recording_has_no_fault(name):
     assert found(take(**GOOD[name])).best is None
 
 
-def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
+def zoomed_from_frame_20(factor):
     scene = take()
     data, centre = scene.data, (np.array(scene.image_size_px) - 1) / 2
-    zoom = np.where(data.frame >= 20, 1.03, 1.0)[:, None]
+    zoom = np.where(data.frame >= 20, factor, 1.0)[:, None]
     left, right = (centre + zoom * (u - centre) for u in (data.u_left, data.u_right))
-    best = found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+    return found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+
+
+def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
+    best = zoomed_from_frame_20(1.03)
     assert best.name == "camera_moved" and "zoomed at about frame 20" in best.text and "no zoom" in best.cure
 
 
 def test_frames_that_may_belong_to_either_side_of_a_small_zoom_are_left_out():
-    scene = take()
-    data, centre = scene.data, (np.array(scene.image_size_px) - 1) / 2
-    zoom = np.where(data.frame >= 20, 1.018, 1.0)[:, None]
-    left, right = (centre + zoom * (u - centre) for u in (data.u_left, data.u_right))
-    best = found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+    best = zoomed_from_frame_20(1.018)
     first, last = map(int, re.search(r"at about frame \d+ \((\d+) to (\d+)\)", best.text).groups())
     assert first < last and first <= 20 <= last
     assert f"(--frames 0:{first}, --frames {last}:40)" in best.cure
