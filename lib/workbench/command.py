@@ -82,13 +82,16 @@ def run(
 
     While a cell that is tagged `lib.workbench.execution.ALONE` runs, the other notebooks wait.  If a notebook fails, the
     others still run.  The report is written after each, so a killed run leaves a readable one.  An unknown notebook or
-    parameter, or a value of the wrong type, is a ValueError before anything runs.  An OSError means that the report cannot
-    be written; its state is then "failed", if that can still be written.
+    parameter, or a value of the wrong type, is a ValueError before anything runs, and a missing recording a
+    FileNotFoundError.  An OSError later means that the report cannot be written; its state is then "failed", if that can
+    still be written.
     """
     chosen = execution.choose_notebooks(names, notebooks)
     if any(name == "profile" for name, _ in pairs):
         raise ValueError("parameter profile: give it as --profile.")
     values = execution.parse_parameters(pairs, chosen, profile)
+    if (folder := dict(pairs).get("recording")) and not (Path(folder) / "recording.toml").is_file():
+        raise FileNotFoundError(f"parameter recording: {folder} has no recording.toml. Give the folder of a recording.")
     jobs = min(cores(), _AT_ONCE) if jobs is None else jobs
     if jobs < 1:
         raise ValueError(f"jobs: {jobs} notebooks at once; give at least 1.")

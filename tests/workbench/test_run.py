@@ -256,6 +256,15 @@ def test_exit_codes(without_kernels, tmp_path, monkeypatch, capsys):
     assert "nan is not a number of seconds above 0" in capsys.readouterr().err
 
 
+def test_a_missing_recording_is_named_before_anything_runs(write_notebook, tmp_path):
+    books, runs = tmp_path / "books", tmp_path / "runs"
+    books.mkdir()
+    write_notebook(books, "03_mine", parameters='recording: str = ""  # folder')
+    with pytest.raises(FileNotFoundError, match=r"parameter recording: .*books has no recording\.toml"):
+        run(pairs=[("recording", str(books))], runs=runs, notebooks=books)
+    assert not runs.exists()
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
 def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatch, name, code):
