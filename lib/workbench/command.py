@@ -81,10 +81,9 @@ def run(
     """Execute notebooks, `jobs` at once, into a new folder of `runs`, and return the content of its metrics.json.
 
     While a cell that is tagged `lib.workbench.execution.ALONE` runs, the other notebooks wait.  If a notebook fails, the
-    others still run.  The report is written after each, so a killed run leaves a readable one.  An unknown notebook or
-    parameter, or a value of the wrong type, is a ValueError before anything runs, and a missing recording a
-    FileNotFoundError.  An OSError later means that the report cannot be written; its state is then "failed", if that can
-    still be written.
+    others still run.  The report is written after each, so a killed run leaves a readable one.  Before anything runs, an
+    unknown notebook or parameter and a wrong value are a ValueError, a missing recording is a FileNotFoundError.  A later
+    OSError means that the report cannot be written; its state is then "failed", if that can still be written.
     """
     chosen = execution.choose_notebooks(names, notebooks)
     if any(name == "profile" for name, _ in pairs):
