@@ -108,7 +108,7 @@ def main_calibrate(argv: list[str]) -> int:
 
 
 def main_reconstruct(argv: list[str]) -> int:
-    """`python3 -m lib reconstruct`: the surface in one stereo frame; writes GLB, PLY, a depth map, the rectified pair."""
+    """`python3 -m lib reconstruct`: the surface in one stereo frame; writes CSV, GLB, PLY, depth, the rectified pair."""
     a, recording, out = _parsed("reconstruct", main_reconstruct, argv)
     rig, offsets, verdict, data = _calibrated(a, recording, out)
     if rig is None:
@@ -134,6 +134,7 @@ def main_reconstruct(argv: list[str]) -> int:
         cure = "Others may be wrong, too: compare the surface with the images, or show a texture that does not repeat."
         verdict = Verdict.join([verdict, Verdict((Reason("ambiguous_texture", LEVELS[1], text, cure),))])
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
+    _write_points(out / "points.csv", found)
     try:
         save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
         save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
@@ -349,6 +350,14 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
         (info := out / f"{prefix}{side}_camera_info.yaml").unlink(missing_ok=True)  # from an earlier run
         if not getattr(camera, "radial_per_px2", 0.0):
             write_ros(camera, info, recording.image_size_px, name=side)
+
+
+def _write_points(path: Path, found: Reconstruction) -> None:
+    sd_mm = np.sqrt(np.diagonal(found.points.covariance_mm2, axis1=1, axis2=2))  # by the matches alone
+    names = ["left_x_px", "left_y_px", "right_x_px", "right_y_px", "x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]
+    table = np.hstack([found.u, found.matches.u_right, found.points.x_mm, sd_mm])
+    with files.whole(path) as new:
+        np.savetxt(new, table, fmt="%.4f", delimiter=",", header=",".join(names), comments="")
 
 
 def _write_rectified(out: Path, found: Reconstruction, left: np.ndarray, right: np.ndarray) -> None:

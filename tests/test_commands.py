@@ -244,8 +244,12 @@ def test_reconstruct_without_open3d_writes_the_rest(out, tmp_path, monkeypatch, 
     assert commands.main_reconstruct([*argv, "--rig", str(out / "rig.json")]) == 0
     assert "Without surface.glb and points.ply: Open3D does not load" in capsys.readouterr().out
     found = {path.name for path in tmp_path.iterdir()}
-    assert {"depth.tiff", "rectified_left.png", "refined_rig.json", "reconstruction.json"} <= found
+    assert {"points.csv", "depth.tiff", "rectified_left.png", "refined_rig.json", "reconstruction.json"} <= found
     assert not {"surface.glb", "points.ply"} & found
+    u_left, u_right, x_mm, sd_mm = np.split(np.loadtxt(tmp_path / "points.csv", delimiter=",", skiprows=1), [2, 4, 7], axis=1)
+    assert len(x_mm) == json.loads((tmp_path / "reconstruction.json").read_text())["points"]
+    off_mm = np.abs(StereoRig.load(tmp_path / "refined_rig.json").triangulate(u_left, u_right).x_mm - x_mm)  # unweighted
+    assert np.median(off_mm) < 0.002 and off_mm.max() < 0.1 and 0 < sd_mm.min() and np.median(sd_mm) < 0.1
 
 
 def test_reconstruct_names_the_cause_if_the_cameras_do_not_fit_the_images(out, tmp_path, monkeypatch):
