@@ -32,8 +32,6 @@ from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, repor
 
 #: Least number of landmarks for comparing a rig with cameras calibrated from them (fewer are overfitted), and least error.
 _FEWEST, _EXACT_PX = 24, 0.5
-#: Fewer points for each pixel that is not masked show, in the setting "quality", that the images are smooth or noisy.
-_FEW = 1e-3
 _NAMED = 8  # most frames that `detect` names
 
 
@@ -146,10 +144,8 @@ def main_reconstruct(argv: list[str]) -> int:
         save_depth_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
     _write_rectified(out, found, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
-    few = a.setting == "quality" and len(found.u) < _FEW * (~found.mask_left).sum()
-    hint = " These are few: --setting fast may be more accurate, as in smooth images." if few else ""
     hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."
-    print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches. {hidden}{hint}")
+    print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches. {hidden}")
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches, "ambiguous": found.matches.ambiguous}
     return _done(a, out, "reconstruction", numbers, verdict)
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
-from lib.matching.band import MAX_PIXELS, RigMisfitError, match_band
+from lib.matching.band import LEAST_SCORE, MAX_PIXELS, RigMisfitError, match_band
 from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
 from lib.matching.masks import checked_mask, dark_mask, glint_mask, tool_mask
@@ -38,8 +38,9 @@ def match(
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `dark_mask`, `tool_mask`).
         depth_range_mm: (near, far): the depths d.x to search, where d is the left camera's `viewing_direction` and x a point
             in the rig's frame, so depth 0 is at that frame's origin.  None = found by a coarse pass.  Only used with a rig.
-        setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong ones are below), else 0.
+        setting: "quality" searches at full resolution (up to 3 Mpx), and "band" in noisy or smooth images at a lower one;
+            "fast" searches at up to 0.4 Mpx.  Not for "deepmatching".
+        min_score: Matches with a lower score are dropped.  None is 0.5 for "band", else 0.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
         budget_bytes: Memory that "band" and "deepmatching" may use; a search that needs more, by prediction, is refused.
         max_epipolar_px: A rig is refused if the median distance of coarse free matches to its epipolar lines is larger.  With
@@ -81,7 +82,7 @@ def match(
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
     u = np.hstack([matches.u_left, matches.u_right])
     inside = ((u >= 0) & (u <= np.subtract((*images[0].shape[::-1], *images[1].shape[::-1]), 1))).all(axis=1)
-    least = (0.5 if method == "band" else 0.0) if min_score is None else min_score
+    least = (LEAST_SCORE if method == "band" else 0.0) if min_score is None else min_score
     matches = matches.keep(inside & (matches.score >= least))
     if rig is None or not len(matches):
         return matches

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.band import CELL_PX, DOWNSCALE, Images, Masks, Where, coarse_reach_px, plan_search
+from lib.matching.band import CELL_PX, DOWNSCALE, MAX_PIXELS, Images, Masks, Where, coarse_reach_px, plan_search
 from lib.matching.deepmatching import correlation_volume, peak_ratio
 from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import on_image, warp
@@ -66,7 +66,7 @@ def match_with(
     named = isinstance(function, str)
     call = {"sgbm": partial(_sgbm, checked=reciprocal), "dis": _dis}[function] if named else function
     name = function if named else getattr(function, "__name__", "callable")
-    plan = plan_search(images, masks, rig, where)
+    plan = plan_search(images, masks, rig, where, MAX_PIXELS[where[0]][0])
     if plan is None:
         return Matches.none(name)
     rectification, scale, (low, high), _ = plan

@@ -211,7 +211,6 @@ def reconstruct(
     with _timed(seconds, "surface"):
         if len(matches) < (least := fewest_points(control)):
             cure = "Are both images sharp and textured, do they show the same part, does the rig fit?"
-            cure += "" if fast else " In smooth images setting='fast' finds more."
             cure += " The texture repeats, so most matches fit several places." if found.ambiguous > 0.5 else ""
             raise ValueError(f"left, right: {len(matches)} matches lie on their epipolar lines; {least} are needed. {cure}")
         domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED, Matches, glint_mask, match
+from lib.matching.band import MAX_PIXELS
 from lib.simulator.rig import reference_rig
 from notebooks.studies.matching_evaluation import detection_auc
 
@@ -61,6 +64,24 @@ def test_fast_setting_shrinks_large_images(affine_pair):
     along = matches.u_right - scaled.right.project(affine_pair.surface((matches.u_left - 1) / 3))
     assert np.median(np.abs(along)) < 0.6
     assert len(matches) > 0.65 * 400_000 / 8**2
+
+
+def test_noisy_images_are_searched_on_a_coarser_canvas(affine_pair):
+    """There more patches match, and better."""
+    rng = np.random.default_rng(0)
+    large = [np.kron(image, np.ones((2, 2))) for image in (affine_pair.left, affine_pair.right)]
+    noisy = [(image + rng.normal(0, 60, image.shape)).clip(0, 255).astype(np.uint8) for image in large]
+    cameras = affine_pair.rig.left, affine_pair.rig.right
+    rig = StereoRig(*(AffineCamera(np.column_stack([2 * one.linear, 2 * one.offset_px + 0.5])) for one in cameras))
+    errors_px = {}
+    for name, canvases in (("all", (3_000_000, 400_000)), ("fine", (3_000_000,))):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(MAX_PIXELS, "quality", canvases)
+            found = match(*noisy, rig=rig)
+        half = replace(found, u_left=(found.u_left - 0.5) / 2, u_right=(found.u_right - 0.5) / 2)
+        errors_px[name] = np.abs(affine_pair.errors_px(half)[0])
+    assert len(errors_px["all"]) > 2 * len(errors_px["fine"])
+    assert (errors_px["all"] > 2).mean() < 0.5 * (errors_px["fine"] > 2).mean()
 
 
 def test_depth_range_limits_the_search(affine_pair):

@@ -195,7 +195,7 @@ def window(x: int, y: int, size: int) -> np.ndarray:
         ({"mask_left": np.ones((5, 5), dtype=bool)}, "mask_left: expected a bool array"),
         ({"mask_right": np.zeros((360, 640))}, "mask_right: expected a bool array"),
         ({"setting": "best"}, "setting"),
-        ({"right": np.zeros((360, 640, 3), np.uint8)}, "left, right: 0 matches .* In smooth images setting='fast'"),
+        ({"right": np.zeros((360, 640, 3), np.uint8)}, "left, right: 0 matches .* does the rig fit"),
         ({"rig": "off its lines"}, r"rig: it does not fit the images: .* px, .* px are allowed"),
     ],
 )
