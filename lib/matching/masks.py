@@ -6,10 +6,10 @@ from numpy.typing import ArrayLike
 
 #: Square root of the area in px to which `dark_mask` reduces images, which averages noise.
 DARK_SIZE_PX = 360
-#: Limits of `dark_mask`, relative to the level of the bright areas.  A surround is darker than DARK, its rim than DIM.  It is
-#: flat: the standard deviation in 7 x 7 px is below FLAT.  It has one level: the 5th and 75th percentiles differ by less than
-#: CONSTANT.  Noise allows no less than 0.5 and 1 grey values for these two.
-DARK, DIM, FLAT, CONSTANT = 0.125, 0.5, 0.01, 0.02
+#: Limits of `dark_mask`.  Relative to the level of the bright areas, a surround is darker than DARK, its rim than DIM, and its
+#: standard deviation in 7 x 7 px is below FLAT.  It has one level: the 5th and 75th percentiles differ by less than CONSTANT
+#: times its median, and ALIKE times the bright level.  Noise allows no less than 0.5 and 1 grey values for these limits.
+DARK, DIM, FLAT, CONSTANT, ALIKE = 0.25, 0.5, 0.01, 0.2, 0.025
 
 
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
@@ -35,17 +35,17 @@ def dark_mask(image: np.ndarray) -> np.ndarray:
     factor = max(1, round(np.sqrt(height * width) / DARK_SIZE_PX))
     small = cv2.resize(np.ascontiguousarray(image), (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     level = small.reshape(*small.shape[:2], -1).max(axis=2).astype(np.float32)
-    bright = level[level < 245]  # without glints; a mean weighted by itself hardly depends on the size of a dark area
-    bright = (bright**2).sum() / max(bright.sum(), 1.0)
+    bright = level[level < 245]  # without glints; a mean weighted by squares hardly depends on the size of a dark area
+    bright = (bright**3).sum() / max((bright**2).sum(), 1.0)
     level = cv2.blur(level, (3, 3))
     variance = cv2.blur(level**2, (7, 7)) - cv2.blur(level, (7, 7)) ** 2
     flat = variance < max(FLAT * bright, 0.5) ** 2
     core = cv2.morphologyEx((flat & (level < DARK * bright)).view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5)))  # no specks
-    areas = cv2.connectedComponents(cv2.dilate(core, np.ones((15, 15))))[1]
+    areas = cv2.connectedComponents(cv2.morphologyEx(core, cv2.MORPH_CLOSE, np.ones((15, 15))))[1]  # with what lies between
     for area in range(1, areas.max() + 1):
-        low, high = np.percentile(level[inside := areas == area], (5, 75))  # the rest may lie beyond the rim
+        low, usual, high = np.percentile(level[inside := areas == area], (5, 50, 75))
         at_border = inside[[0, -1]].any() or inside[:, [0, -1]].any()
-        core[inside] &= at_border and high - low < max(CONSTANT * bright, 1.0)
+        core[inside] &= at_border and high - low < max(min(CONSTANT * usual, ALIKE * bright), 1.0)
     soft = cv2.dilate(core, np.ones((31, 31))) & (level < DIM * bright).view(np.uint8)  # the blurred rim of the core, too
     grown = cv2.dilate(soft, np.ones((5, 5)))
     return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
