@@ -6,9 +6,9 @@ from numpy.typing import ArrayLike
 
 #: Square root of the area in px to which `dark_mask` reduces images, which averages noise.
 DARK_SIZE_PX = 360
-#: Limits of `dark_mask`.  Relative to the level of the bright areas, a surround is darker than DARK, its rim than DIM, and its
-#: standard deviation in 7 x 7 px is below FLAT.  It has one level: the 5th and 75th percentiles differ by less than CONSTANT
-#: times its median, and ALIKE times the bright level.  Noise allows no less than 0.5 and 1 grey values for these limits.
+#: Limits of `dark_mask`.  Relative to the level of the bright areas, a surround is darker than DARK, its rim than DIM, and
+#: its standard deviation in 7 x 7 px is below FLAT.  It has one level: the 5th and 75th percentiles differ by less than
+#: CONSTANT times its median, and ALIKE times the bright level.  Noise allows no less than 0.5 and 1 grey values for these.
 DARK, DIM, FLAT, CONSTANT, ALIKE = 0.25, 0.5, 0.01, 0.2, 0.025
 
 
