@@ -147,6 +147,9 @@ def main_reconstruct(argv: list[str]) -> int:
     hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."
     print(f"Frame {a.frame}: {len(found.u)} points from {found.n_matches} matches. {hidden}")
     numbers = {"frame": a.frame, "points": len(found.u), "matches": found.n_matches, "ambiguous": found.matches.ambiguous}
+    if isinstance(rig, Calibration):
+        numbers["depth_sd_of_cameras_mm"] = sd_mm = float(np.median(rig.depth_sd_mm(found.points.x_mm)))
+        print(f"The cameras' errors shift neighbouring points alike, in depth by {1e3 * sd_mm:.0f} um (sd).")
     return _done(a, out, "reconstruction", numbers, verdict)
 
 

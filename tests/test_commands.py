@@ -294,6 +294,7 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
     monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
     monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
     assert commands.main_reconstruct([*argv, "--setting", "fast"]) == 0
+    assert 0 < json.loads((tmp_path / "out" / "reconstruction.json").read_text())["depth_sd_of_cameras_mm"] < 1
     assert not (tmp_path / "out" / "depth.tiff").exists(), "it would pass for this run's"
     with pytest.raises(ValueError, match="unknown model 'near'; take one of .*near_affine"):
         commands.main_calibrate([*argv, "--model", "near"])
