@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from lib.cameras import StereoRig
 from lib.matching.band import LEAST_SCORE, MAX_PIXELS, RigMisfitError, match_band
 from lib.matching.deepmatching import match_free
-from lib.matching.descriptors import as_gray
+from lib.matching.descriptors import as_gray, of_equal_contrast
 from lib.matching.masks import checked_mask, dark_mask, glint_mask, tool_mask
 from lib.matching.opencv import match_with
 from lib.matching.rectification import RECTIFIED
@@ -28,7 +28,7 @@ def match(
     """Match the two images of a stereo pair.
 
     Args:
-        left, right: (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
+        left, right: (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes, gain and stray light may differ.
         method: "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for `epipolar_px`.
             "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.  "sgbm", "dis": OpenCV's, on rectified
             images; without a rig the pair is taken as rectified.  A callable `f(left, right, (low, high)) -> (disparity,
@@ -70,14 +70,15 @@ def match(
             raise ValueError(f"{name}: expected a number, got NaN.")
     method = ("deepmatching" if rig is None else "band") if method is None else method
     where = (setting, depth_range_mm, max_epipolar_px)
+    alike = images if method == "deepmatching" else of_equal_contrast(images, masks)
     if method == "deepmatching":
         matches = match_free(images, masks, downscale, budget_bytes=budget_bytes, reciprocal=reciprocal, device=device)
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
-        matches = match_band(images, masks, rig, where, budget_bytes=budget_bytes, reciprocal=reciprocal)
+        matches = match_band(alike, masks, rig, where, budget_bytes=budget_bytes, reciprocal=reciprocal)
     elif callable(method) or method in ("sgbm", "dis"):
-        matches = match_with(method, images, masks, rig or RECTIFIED, where, reciprocal=reciprocal)
+        matches = match_with(method, alike, masks, rig or RECTIFIED, where, reciprocal=reciprocal)
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
     u = np.hstack([matches.u_left, matches.u_right])

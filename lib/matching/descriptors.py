@@ -18,6 +18,8 @@ CONSTANT = 0.3
 #: Distance at which pixels influence a descriptor: three blurs of 3 px and a gradient of 1 px.
 REACH_PX = 10
 STRIP_PIXELS = 1 << 17
+#: Longer side of the small copies that show the contrast of images, and the largest gain that equalises it.
+SMALL_PX, MOST_GAIN = 256, 5.0
 #: Mean squared length of the orientation channels below which a patch is flat: gradients well below 1 grey value.
 MIN_TEXTURE = 1e-4
 
@@ -35,6 +37,31 @@ def as_gray(image: ArrayLike, name: str) -> np.ndarray:
     if min(image.shape[:2]) < 16:
         raise ValueError(f"{name}: {image.shape[1]} x {image.shape[0]} px is too small; give at least 16 x 16 px.")
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+
+
+def of_equal_contrast(images: tuple[np.ndarray, ...], masks: tuple[np.ndarray | None, ...]) -> tuple[np.ndarray, ...]:
+    """Both grey images (h, w) as float32, with the higher of their mean levels, and of their contrasts.
+
+    The eyes of a microscope may differ in gain and stray light, and descriptors depend on the contrast, since they saturate.
+    It is the upper quartile of the gradient in small copies, where noise and blur count little.  `masks` as in
+    `lib.matching.match`.
+    """
+    levels, contrasts = [], []
+    for image, mask in zip(images, masks, strict=True):
+        factor = max(1, max(image.shape) // SMALL_PX)
+        size = image.shape[1] // factor, image.shape[0] // factor
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        hidden = np.zeros_like(small) if mask is None else cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_AREA)
+        seen = cv2.dilate(hidden, np.ones((3, 3))) == 0
+        slope = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
+        levels.append(small[seen].mean() if seen.any() else 0.0)
+        contrasts.append(np.percentile(slope[seen], 75) if seen.any() else 0.0)
+    level, contrast = max(levels), max(contrasts)
+    gains = [min(contrast / max(own, 1e-6), MOST_GAIN) for own in contrasts]
+    return tuple(
+        (image - np.float32(own)) * np.float32(gain) + np.float32(level)
+        for image, own, gain in zip(images, levels, gains, strict=True)
+    )
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

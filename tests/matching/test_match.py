@@ -66,6 +66,19 @@ def test_fast_setting_shrinks_large_images(affine_pair):
     assert len(matches) > 0.65 * 400_000 / 8**2
 
 
+@pytest.mark.parametrize("method", ["band", "sgbm", "dis"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_eyes_of_unlike_gain_and_stray_light_match(affine_pair, method, side):
+    images = {"left": affine_pair.left, "right": affine_pair.right}
+    alike = match(**images, method=method, rig=affine_pair.rig)
+    images[side] = (0.4 * images[side] + 90).astype(np.uint8)
+    found = match(**images, method=method, rig=affine_pair.rig)
+    errors_px = [np.abs(affine_pair.errors_px(one)[0]) for one in (alike, found)]
+    assert len(found) > 0.95 * len(alike)
+    assert np.median(errors_px[1]) < 1.3 * np.median(errors_px[0])
+    assert (errors_px[1] > 2).mean() < (errors_px[0] > 2).mean() + 0.01
+
+
 def test_noisy_images_are_searched_on_a_coarser_canvas(affine_pair):
     """There more patches match, and better."""
     rng = np.random.default_rng(0)
