@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from lib.calibration import Calibration
-from lib.cameras import AffineCamera, Points, StereoRig
+from lib.cameras import Points, StereoRig
 from lib.matching import Matches, checked_mask, dark_mask, glint_mask, match, tool_mask
 from lib.surface.bspline import BSplineSurface, fewest_points, fit_surface, sign_inflation
 
@@ -78,9 +78,8 @@ def _off_lines(rig: StereoRig, matches: Matches) -> np.ndarray:
     common = np.median(distance[known]) if known.any() else 0.0
     if known.sum() >= _BENDING:
         x, y = ((matches.u_left - matches.u_left.mean(axis=0)) / np.maximum(matches.u_left.std(axis=0), 1)).T
-        bend = np.column_stack([x * x, x * y, y * y, x, y])
-        found, _ = _regression(bend[known], distance[known] - common, sigma[known])
-        common = common + bend @ found[:-1] + found[-1]
+        bend = np.column_stack([x * x, x * y, y * y, x, y, np.ones(len(x))])
+        common = common + bend @ _regression(bend[known], distance[known] - common, sigma[known])[0]
     return distance - common
 
 
@@ -90,44 +89,36 @@ def in_company(x_mm: np.ndarray) -> np.ndarray:
     return third <= _ALONE * np.median(third) if len(x_mm) else np.zeros(0, dtype=bool)
 
 
-def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
-    """The rig that agrees best with its own calibration and with the epipolar geometry of dense matches.
+def refine_rig(calibration: Calibration, matches: Matches) -> StereoRig:
+    """The cameras that agree best with their own calibration and with the epipolar geometry of dense matches.
 
-    With true cameras (A*, t*) and the unit normal n of the calibrated rig, n.A = 0, the epipolar distance of a match is
-    n.((A* - A) x + (t* - t)) plus noise, which is linear in the point x.  So a robust regression over all matches measures
-    four combinations of the calibration's errors.  The update of a Kalman filter with the calibration as its prior corrects
-    all sixteen entries of the matrices by them.  Few or poor matches change little.
+    In the space of a match's four pixels, the unit normal n to the derivatives by its point is the direction that no point
+    explains.  So the match's residual along n is that of the cameras plus noise, linear in small changes of their
+    parameters.  The update of a Kalman filter with the calibration as its prior corrects all parameters by a robust
+    regression over all matches.  Few or poor matches change little.
 
     Args:
-        rig: A calibrated affine pair; a ValueError refuses other cameras.
-        covariance: (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
-        matches: From `lib.matching.match` with this rig, best of the static scene, with the tool masked.
+        calibration: Of a stereo pair; a ValueError refuses a single camera.
+        matches: From `lib.matching.match` with its rig, best of the static scene, with the tool masked.
     """
-    if rig is None or not rig.is_affine:
-        raise ValueError("rig: only an affine stereo pair can be refined; reconstruct with refine=False.")
-    prior = np.asarray(covariance, dtype=np.float64)
-    if prior.shape != (16, 16):
-        raise ValueError(f"covariance: expected (16, 16), the entries of both matrices, got {prior.shape}.")
+    rig, prior = calibration.pair, calibration.parameter_covariance
+    points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
+    matches, x_mm = matches.keep(known := np.isfinite(points.x_mm).all(axis=1)), points.x_mm[known]
     if len(matches) < 5:
         return rig
-    normal = rig.epipolar_normal
-    points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
-    centre = points.x_mm.mean(axis=0)
-    measured, information = _regression(points.x_mm - centre, points.epipolar_px, matches.sigma_along(normal))
-
-    # Jacobian (4, 16) of the four measured numbers with respect to the entries of the matrices.
-    about_centre = np.eye(4)
-    about_centre[3, :3] = centre
-    effect = np.hstack([n * about_centre for n in normal])
-    # Information form, since for a flat scene the covariance is infinite: the change with depth is not measured.
-    innovation = np.linalg.solve(np.eye(4) + information @ effect @ prior @ effect.T, information @ measured)
-    matrices = np.vstack([rig.left.matrix, rig.right.matrix]) + (prior @ effect.T @ innovation).reshape(4, 4)
-    return StereoRig(AffineCamera(matrices[:2]), AffineCamera(matrices[2:]))
+    by_point, by_parameters = calibration.derivatives(x_mm)
+    normal = np.linalg.svd(by_point)[0][:, :, 3]
+    off = np.hstack([matches.u_left, matches.u_right]) - np.hstack(rig.project(x_mm))
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, matches.covariance_px2, normal))
+    measured, information = _regression(np.einsum("ni,nip->np", normal, by_parameters), (normal * off).sum(axis=1), sigma)
+    # Information form, since matches alone leave most combinations of the parameters undetermined.
+    step = prior @ np.linalg.solve(np.eye(len(prior)) + information @ prior, information @ measured)
+    return StereoRig(*calibration.minimum.state.moved(step).cameras())
 
 
 def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Robust coefficients (k + 1,) of value (n,) on [x; 1], x (n, k), and their information: reweighted least squares."""
-    design = np.column_stack([x, np.ones(len(x))]) / sigma[:, None]
+    """Robust coefficients (k,) of value (n,) on x (n, k), and their information: reweighted least squares."""
+    design = x / sigma[:, None]
     target, weight = value / sigma, np.ones(len(x))
     for _ in range(20):
         weighted = design * weight[:, None]
@@ -157,7 +148,7 @@ def reconstruct(
         setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
             approximate choice of smoothness, and `depth_only`.
         method: The matcher; see `lib.matching.match`.
-        refine: Correct the rig with a first, fast matching (`refine_rig`); None = only for a calibration of affine cameras.
+        refine: Correct the rig with a first, fast matching (`refine_rig`); None = if a calibration is given.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
         mask_left, mask_right: (h, w) bool, True = ignore, in addition to glints, darkness and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.
@@ -179,10 +170,10 @@ def reconstruct(
     True
     """
     seconds = {} if seconds is None else seconds
-    covariance, rig = (rig.covariance, rig.pair) if isinstance(rig, Calibration) else (None, rig)
-    if refine and covariance is None:
+    calibration, rig = (rig, rig.pair) if isinstance(rig, Calibration) else (None, rig)
+    if refine and calibration is None:
         raise ValueError("refine: needs the covariance of the rig; give the Calibration in place of its rig.")
-    refine = covariance is not None and rig.is_affine if refine is None else refine
+    refine = calibration is not None if refine is None else refine
     low, high = percentiles
     if not 0 <= low < high <= 100:
         raise ValueError(f"percentiles: expected 0 <= low < high <= 100, got {percentiles}.")
@@ -199,7 +190,7 @@ def reconstruct(
                 masks[name] |= checked_mask(given, masks[name].shape, name)
     if refine:
         with _timed(seconds, "refine"):
-            rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **masks))
+            rig = refine_rig(calibration, match(left, right, rig=rig, setting="fast", **masks))
     with _timed(seconds, "match"):
         where = {"depth_range_mm": depth_range_mm, "max_epipolar_px": max_epipolar_px}
         found = match(left, right, rig=rig, method=method, setting=setting, **where, **masks)

@@ -36,10 +36,6 @@ def calibrated(seed: int, **weights):
     return calibrate(c.x_mm, [c.u_left, c.u_right], **weights), c.true_rig, rng
 
 
-def refined_by(calibration, matches: Matches):
-    return refine_rig(calibration.rig, calibration.covariance, matches)
-
-
 def epipolar_rms_px(rig, true_rig) -> float:
     x = bowl_mm(2000, np.random.default_rng(99))
     return float(np.sqrt(np.mean(rig.epipolar_distance(*true_rig.project(x)) ** 2)))
@@ -48,7 +44,7 @@ def epipolar_rms_px(rig, true_rig) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_the_matches_epipolar_geometry_is_taken_over(seed):
     calibration, true_rig, rng = calibrated(seed)
-    refined = refined_by(calibration, matches_of(true_rig, bowl_mm(4000, rng), rng, outliers=0.15))
+    refined = refine_rig(calibration, matches_of(true_rig, bowl_mm(4000, rng), rng, outliers=0.15))
     before, after = epipolar_rms_px(calibration.rig, true_rig), epipolar_rms_px(refined, true_rig)
     assert after < 0.03 < before
     # What the matches cannot know stays: points move by far less than the calibration is unsure of.
@@ -62,17 +58,17 @@ def test_the_matches_epipolar_geometry_is_taken_over(seed):
 def test_little_is_learnt_from_little():
     calibration, true_rig, rng = calibrated(5)
     every = matches_of(true_rig, bowl_mm(4000, rng), rng)
-    few = refined_by(calibration, every.keep(slice(6)))
-    much = refined_by(calibration, every)
+    few = refine_rig(calibration, every.keep(slice(6)))
+    much = refine_rig(calibration, every)
     moved = [np.abs(rig.left.matrix - calibration.rig.left.matrix).max() for rig in (few, much)]
     assert moved[0] < moved[1]
-    assert np.array_equal(refined_by(calibration, every.keep(slice(3))).left.matrix, calibration.rig.left.matrix)
+    assert np.array_equal(refine_rig(calibration, every.keep(slice(3))).left.matrix, calibration.rig.left.matrix)
 
 
 def test_a_flat_scene_leaves_open_what_it_does_not_show():
     calibration, true_rig, rng = calibrated(6)
     flat = ROBOT_FROM_MICROSCOPE.apply(np.column_stack([rng.uniform((-8, -4.5), (8, 4.5), (3000, 2)), np.zeros(3000)]))
-    refined = refined_by(calibration, matches_of(true_rig, flat, rng))
+    refined = refine_rig(calibration, matches_of(true_rig, flat, rng))
     assert np.isfinite(refined.linear).all()
     on_plane = np.sqrt(np.mean(refined.epipolar_distance(*true_rig.project(flat)) ** 2))
     assert on_plane < 0.03
@@ -82,7 +78,7 @@ def test_cameras_that_agree_are_left_alone():
     calibration, _, rng = calibrated(7)
     x = bowl_mm(4000, rng)
     matches = matches_of(calibration.rig, x, rng)
-    refined = refined_by(calibration, matches)
+    refined = refine_rig(calibration, matches)
     for u, v in zip(refined.project(x), calibration.rig.project(x), strict=True):
         assert np.abs(u - v).max() < 0.03
 
@@ -90,5 +86,5 @@ def test_cameras_that_agree_are_left_alone():
 def test_one_camera_is_refused():
     c = simulate_correspondences(60, rng=np.random.default_rng(0))
     single = calibrate(c.x_mm, [c.u_left])
-    with pytest.raises(ValueError, match="rig: only an affine stereo pair"):
-        refined_by(single, matches_of(c.true_rig, c.true_x_mm, np.random.default_rng(0)))
+    with pytest.raises(ValueError, match="calibration: this needs a stereo pair"):
+        refine_rig(single, matches_of(c.true_rig, c.true_x_mm, np.random.default_rng(0)))
