@@ -209,15 +209,17 @@ def _match_on(
     canvas = (start + PATCH / 2) * float(CELL_PX) - 0.5
     deviation = np.hypot(SIGMA_GAIN * sigma, SIGMA_FLOOR) * CELL_PX
     linear = rectification.right_from_canvas[:, :2]
+    score = 1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4)
+    clear = score >= LEAST_SCORE  # noise is ambiguous, too, such as in what the lamp does not reach
     covariance = np.zeros((len(sigma), 4, 4))
     covariance[:, :2, :2] = SIGMA_LEFT_PX**2 * np.eye(2)
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", linear, deviation**2, linear)
     matches = Matches(
         on_image(rectification.left_from_canvas, canvas),
         on_image(rectification.right_from_canvas, canvas + displacement * CELL_PX + (0.0, off_line_px)),
-        unique / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
+        unique * score,
         covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
-        ambiguous=float(1 - unique.mean()) if unique.size else 0.0,
+        ambiguous=float((~unique[clear]).mean()) if clear.any() else 0.0,
     )  # fmt: skip
     return matches, textured
 

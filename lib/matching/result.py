@@ -23,8 +23,8 @@ class Matches:
             band), or to within a pixel (SGBM, DIS).  `match` drops the others by default.
         method: Name of the matcher.
         epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
-        ambiguous: Share of the matches that fit another place on their epipolar line nearly as well (band): their score is 0,
-            so `match` drops them by default.  NaN for other matchers.
+        ambiguous: Share of the precise matches that fit another place on their epipolar line nearly as well (band): their
+            score is 0, so `match` drops them by default.  NaN for other matchers.
     """
 
     u_left: np.ndarray

@@ -19,7 +19,7 @@ EPIPOLAR_SIGMAS = 2.0
 #: Least number of matches from which the bend of all epipolar lines is estimated; with fewer only their common shift is.
 _BENDING = 100
 #: Share of ambiguous matches (`Matches.ambiguous`) above which the texture repeats too much to be trusted; on dots printed
-#: in a grid, 12 % of the matches were ambiguous and the surface was right.
+#: in a grid, 2 to 8 % of the matches were ambiguous and the surface was right.
 AMBIGUOUS = 0.25
 #: Points whose third nearest neighbour is this many times as far as usual are dropped.
 _ALONE = 6.0

@@ -272,6 +272,8 @@ def test_a_texture_that_repeats_along_the_lines_is_ambiguous(textured):
         found = match(*(image.astype(np.uint8) for image in pair), **options)
         assert share[0] <= found.ambiguous <= share[1]
         assert (len(found) > 100) == (period_px == 160)
+    dark = [np.concatenate([image, rng.normal(30, 4, (3 * len(image), image.shape[1]))]).astype(np.uint8) for image in pair]
+    assert match(*dark, **options).ambiguous < 0.1, "noise fits anywhere, but imprecisely"
 
 
 def test_epipolar_lines_of_near_cameras_are_followed():
