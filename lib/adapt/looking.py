@@ -17,6 +17,7 @@ from lib.recordings.annotations import CLICK_SD_PX
 
 #: A detected tool stands still if it is in the same place, within this share of its length, in at least 4 frames.
 _STILL, _STILL_FRAMES = 0.15, 4
+_HELD_S = 0.12  # a log may repeat a sample for this long, until the robot renews it
 _SURE, _FEWEST_IMAGES = 0.5, 5  # least confidence of tips, and number of images with two such, that show an exchange
 #: The base has no edge that ends along the shaft.  A detector's constant error there is this multiple of its stated standard
 #: deviation, if that exceeds `OWN_BIAS`.  Chosen by ten recordings of unfamiliar tools, also by two other renderers.
@@ -106,6 +107,16 @@ def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
             spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
             found[i, side] = spread[1] > least_mm
     return found
+
+
+def frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
+    """The frames in which the robot's log repeats one sample to the last digit for longer than `_HELD_S`, or is silent."""
+    k = recording.kinematics
+    same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
+    first = np.append(np.flatnonzero(~same), len(same))  # samples that differ from the one before
+    held_s = k.time_s[first[1:] - 1] - k.time_s[first[:-1]]
+    nearest = np.interp(recording.frames.time_s[frames] + recording.offset_s, k.time_s, np.arange(len(same))).round()
+    return np.asarray(frames)[held_s[np.searchsorted(first, nearest, side="right") - 1] > _HELD_S]
 
 
 def exchanged_tips(seen: Seen, labels: Seen) -> bool:

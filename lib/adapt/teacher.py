@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from scipy.optimize import least_squares
 
-from lib.adapt.looking import Seen
+from lib.adapt.looking import Seen, frozen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, shown_axes, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
@@ -26,7 +26,7 @@ from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.diagnosis import stated
-from lib.trust.fitting import Problem
+from lib.trust.fitting import SIDES, Problem
 from lib.trust.verdict import with_scene
 
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
@@ -57,7 +57,6 @@ _TURNS_S = 0.02  # between the samples of the log from which axes are taken; sho
 _SURE_MOVE = 0.5
 #: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.
 _LARGEST_STEP_S = 0.03
-_HELD_S = 0.12  # a log may repeat a sample for this long, until the robot renews it
 _BEHIND = 0.1  # least distance from the camera of a visible point, as a share of the working distance
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Fewest labelled pairs that determine outliers and offsets; with fewer, the standard deviation of a robot's usual offsets.
@@ -68,7 +67,9 @@ _ANOTHER_EDGE = 3.0
 #: Error of the base's label along a tool that the detector knows, as a share of its length: 0.004 RMS on twelve recordings,
 #: 0.014 in eleven cases: four others, each with two or three robots that err by 0.2 mm.
 _KNOWN_BASE = 0.01
-_OTHER_POINT = 0.3  # prior sd of the offset from a detector's point to the labelled one, as a share of the tool's length
+#: Prior standard deviations, as shares of the tool's length: of the offset from a detector's point to the labelled one, and
+#: of the shift of an image that errors cause which all landmarks share.
+_OTHER_POINT, _SHARED = 0.3, 0.02
 LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -224,7 +225,7 @@ def teach(
             robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
-    refused = _frozen(recording, np.arange(len(recording)))
+    refused = frozen(recording, np.arange(len(recording)))
     if before is not None:
         recording, refused = before.recording, np.union1d(refused, before.refused)
     in_both = np.isfinite(seen.u).all(axis=3).any(axis=2).all(axis=1)
@@ -302,16 +303,6 @@ def _length_mm(recording: Recording) -> float:
     """Median length of the tool, from its base to the middle of its tips."""
     x = recording.landmarks_mm()
     return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
-
-
-def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
-    """The frames in which the robot's log repeats one sample to the last digit for longer than `_HELD_S`, or is silent."""
-    k = recording.kinematics
-    same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
-    first = np.append(np.flatnonzero(~same), len(same))  # samples that differ from the one before
-    held_s = k.time_s[first[1:] - 1] - k.time_s[first[:-1]]
-    nearest = np.interp(recording.frames.time_s[frames] + recording.offset_s, k.time_s, np.arange(len(same))).round()
-    return np.asarray(frames)[held_s[np.searchsorted(first, nearest, side="right") - 1] > _HELD_S]
 
 
 def _aligned(
@@ -462,25 +453,35 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
-    """The teacher with offsets that are fitted to labels set by hand."""
-    free = teacher.calibration.offsets
+    """The teacher with offsets, and a shift of each camera's image, that are fitted to labels set by hand.
+
+    An error that all landmarks share shifts the cameras: of thick jaws a detector may mark the visible side.
+    """
+    calibration, free = teacher.calibration, teacher.calibration.offsets
     fitted = free is not None and free.offset.shape == (3, 3)
     teacher = replace(teacher, turns=fitted and free.turns)
     start = free.offset.ravel() if fitted else np.zeros(9)
-    wide_mm = _OTHER_POINT * _length_mm(teacher.recording)
+    own_sd, shift_sd = _OTHER_POINT * _length_mm(teacher.recording), _SHARED * np.nanmedian(tool_length_px(labels.u))
 
     def misfit(change: np.ndarray) -> np.ndarray:
-        u = replace(teacher, offset_mm=(start + wide_mm * change).reshape(3, 3)).project(labels.frame)[0]
+        u = replace(teacher, offset_mm=(start + own_sd * change[:9]).reshape(3, 3)).project(labels.frame)[0]
+        u += shift_sd * change[9:].reshape(2, 1, 2)
         return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), change)
 
     known = np.isfinite(labels.u)
     # The robust loss limits the influence of gross errors.
-    found = least_squares(misfit, np.zeros(9), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
-    covariance = wide_mm**2 * max(1.0, 2 * found.cost / known.sum()) * np.linalg.inv(found.jac.T @ found.jac)
+    found = least_squares(misfit, np.zeros(13), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
+    information = found.jac.T @ found.jac / max(1.0, 2 * found.cost / known.sum())
+    own = own_sd**2 * np.linalg.inv(information[:9, :9])  # given the shift, whose variance the cameras get
     marked = known.any(axis=(0, 1, 3))[:, None]  # the other landmarks keep their offsets
-    offset = np.where(marked, (start + wide_mm * found.x).reshape(3, 3), teacher.offset_mm)
-    own = np.where(marked[:, :, None], np.einsum("kikj->kij", covariance.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
-    return replace(teacher, offset_mm=offset, offset_covariance_mm2=own)
+    offset = np.where(marked, (start + own_sd * found.x[:9]).reshape(3, 3), teacher.offset_mm)
+    own = np.where(marked[:, :, None], np.einsum("kikj->kij", own.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
+    names = calibration.parameter_names
+    chosen = np.eye(len(names))[[names.index(f"{side} offset {axis} (px)") for side in SIDES for axis in "xy"]]
+    minimum = replace(calibration.minimum, state=calibration.minimum.state.moved(shift_sd * found.x[9:] @ chosen))
+    covariance = calibration.parameter_covariance + shift_sd**2 * chosen.T @ np.linalg.inv(information)[9:, 9:] @ chosen
+    calibration = replace(calibration, minimum=minimum, parameter_covariance=covariance)
+    return replace(teacher, calibration=calibration, offset_mm=offset, offset_covariance_mm2=own)
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, judging, loop, report, teach, teacher
+from lib.adapt import RefusalError, adapt, judging, looking, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
@@ -445,7 +445,7 @@ def test_a_log_may_hold_its_samples_and_not_stand_still():
     x_mm[(time_s > 6) & (time_s < 7)] = np.nan
     frames_s = np.arange(0.05, 10, 0.1)
     stub = SimpleNamespace(kinematics=Kinematics(time_s, x_mm), frames=SimpleNamespace(time_s=frames_s), offset_s=0.0)
-    refused = frames_s[teacher._frozen(stub, np.arange(100))]
+    refused = frames_s[looking.frozen(stub, np.arange(100))]
     np.testing.assert_array_equal(refused, frames_s[((frames_s > 2) & (frames_s < 4)) | ((frames_s > 6) & (frames_s < 7))])
 
 
@@ -662,6 +662,20 @@ def test_labels_move_a_teacher_that_needs_no_offsets_where_the_robot_is_believed
     off = np.nanmedian((teacher.project(np.arange(world.n))[0] - world.u)[..., 0], axis=(0, 1))
     np.testing.assert_allclose(off, [4.0, 4.0, 0.0], atol=1.2)
     assert 13 in teacher.refused and np.trace(teacher.offset_covariance_mm2, axis1=1, axis2=2).max() < 0.2**2
+
+
+def test_labels_correct_an_error_that_shifts_the_cameras(world, recording):
+    """All landmarks appear nearer than they are, as if the detector marked the visible side of thick jaws."""
+    seen = look(recording, StandIn(world.u + [[[2.0, 0.0]], [[-2.0, 0.0]]], noise_px=0.7), np.arange(world.n))
+    pixels = world.u.transpose(1, 0, 2, 3).reshape(2, -1, 2)
+    off = []
+    for by_hand in (None, five_labelled(world)[1]):
+        teacher = teach(recording, seen, by_hand=by_hand)
+        left, right = np.nanmedian((teacher.project(np.arange(world.n))[0] - world.u)[..., 0], axis=(0, 2))
+        depth = (teacher.calibration.rig.triangulate(*pixels).x_mm - world.at(world.time_s).reshape(-1, 3))
+        off.append((abs(left - right), np.abs(np.median(depth @ teacher.calibration.cameras[0].viewing_direction))))
+    assert off[0][0] > 3.0 and off[1][0] < 0.6
+    assert off[1][1] < 0.25 * off[0][1]
 
 
 @pytest.mark.parametrize(("length_px", "agrees_px", "contradicts_px"), [(300, 4.0, 5.0), (60, 3.2, 4.0)])
