@@ -84,7 +84,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     writer = RecordingWriter(
         out, name=spec.name, description=spec.description, fps=fps, image_size_px=size, readout_s=spec.readout_s,
         offset_s=offset_s, robot_accuracy_mm=spec.robot_accuracy_mm, skeleton=spec.landmarks, overwrite=overwrite,
-        suffix=f".{spec.video.format}", jpeg_quality=spec.video.jpeg_quality,
+        suffix=f".{spec.video.format}", jpeg_quality=spec.video.jpeg_quality, own_times=spec.video.times != "fps",
     )  # fmt: skip
     try:
         with writer:
