@@ -82,11 +82,7 @@ class GrowingGround:
 
 
 def lit(image: np.ndarray) -> np.ndarray:
-    """Which pixels of every fourth row and column of an image (h, w, 3) tell of its light: a black surround does not.
-
-    >>> lit(np.array([[[9, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [8, 0, 0]]], np.uint8)).tolist()
-    [[True, False]]
-    """
+    """Which pixels of every fourth row and column of an image (h, w, 3) tell of its light: a black surround does not."""
     bright = image[::_STEP, ::_STEP].max(axis=2) > _DARK
     return bright if bright.any() else ~bright
 
