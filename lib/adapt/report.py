@@ -95,9 +95,9 @@ def main(argv: list[str]) -> int:
     reason = f"{'Improved' if found.improved else 'Left alone'}: {reason}."
     print("\n".join([reason, *found.report["notes"]]).replace("RECORDING", where), f"Report: {page}", sep="\n")
     offset_s, sd_s = (found.report.get(name, np.nan) for name in ("offset_s", "clock_sd_s"))
-    if recording is not None and abs(offset_s - recording.offset_s) > 3 * sd_s:
-        cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"
-        print(f"The clocks differ by {1e3 * offset_s:.1f} ms, standard deviation {1e3 * sd_s:.1f} ms: {cure}.")
+    if recording is not None and abs(step_s := offset_s - recording.offset_s) > 3 * sd_s:
+        text = f"The stated offset_s is wrong by {1e3 * step_s:.1f} ms, standard deviation {1e3 * sd_s:.1f} ms: "
+        print(text + f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}.")
     if recording is not None and found.improved:
         weights = shlex.quote(paths.shown(out / "weights.safetensors"))
         print(f"Next: python3 -m lib check {where} --weights {weights}, then calibrate with the same weights.")

@@ -84,7 +84,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     writer = RecordingWriter(
         out, name=spec.name, description=spec.description, fps=fps, image_size_px=size, readout_s=spec.readout_s,
         offset_s=offset_s, robot_accuracy_mm=spec.robot_accuracy_mm, skeleton=spec.landmarks, overwrite=overwrite,
-        suffix=f".{spec.video.format}", jpeg_quality=spec.video.jpeg_quality,
+        suffix=f".{spec.video.format}", jpeg_quality=spec.video.jpeg_quality, own_times=spec.video.times != "fps",
     )  # fmt: skip
     try:
         with writer:
@@ -127,12 +127,13 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
     try:
         found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
-        wrong = any(doubt.name == "little_overlap" for doubt in draft.doubts)  # so the search had to find the offset
+        said = {doubt.name: f"{doubt.text} {doubt.cure}" for doubt in draft.doubts if doubt.name != "jump"}
+        wrong = said.pop("little_overlap", None)  # at the offset where the search began, so that it had to find another
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError) and not wrong:
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
         what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
-        cure = f"Or give a number: t_robot = t_video + offset_s. {draft.mistimed}".rstrip()
+        cure = " ".join(["Or give a number: t_robot = t_video + offset_s.", *said.values()])
         raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
     with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))

@@ -20,6 +20,7 @@ from lib.recordings.tables import decoded, number, rows_of
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
 _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this range the unit of time must be wrong
+_ROUNDED = 0.25  # share of the rows that repeat the time before, from which on they count as rounded
 _DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
@@ -55,6 +56,11 @@ def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], un
         if now <= before:
             what = f"the time {'repeats' if now == before else 'goes back'} ({before} s, then {now} s)"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
+            steps = [later - earlier for earlier, later in pairwise(time)]
+            rising = [step for step in steps if step > 0]
+            if min(steps) == 0 and 0 < len(rising) < (1 - _ROUNDED) * len(steps):
+                cure = f"Times seem to be rounded to {min(rising)} s. Export them with more digits; or if the rate is known "
+                cure += "and steady, spread equal times evenly over that step"
             raise ValueError(f"{places[i] if places else f'{where}, entry {i + 1}'}: {what}. {cure}.")
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
     if not usual_s[0] <= step <= usual_s[1]:

@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from lib.recordings.ground import lit, relit
+
 #: `equalised`: number of tiles along each side, and the approximate limit of the contrast gain (CLAHE's clip limit).
 _TILES, _LIMIT = 8, 2.0
 #: `levelled`: sigma of the smoothing against noise, as a share of the longer side.  The gain brings this percentile of the
@@ -10,7 +12,6 @@ _TILES, _LIMIT = 8, 2.0
 _SMOOTHING, _DIFFERENCE_PERCENTILE, _TARGET_DIFFERENCE, _GAIN_RANGE = 1e-3, 99.5, 80.0, (1.0, 4.0)
 #: `stretched`: the percentiles that become black and white.  Percentiles are estimated on every `_STEP`-th row and column.
 _STRETCH_PERCENTILES, _STEP = (1.0, 99.0), 4
-_DARK = 8  # grey value up to which a pixel of the ground may belong to the black surround of a round field
 
 
 def equalised(image: np.ndarray) -> np.ndarray:
@@ -50,13 +51,10 @@ def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """
     if image.shape != ground.shape:
         raise ValueError(f"ground: expected {image.shape}, the same as the image, got {ground.shape}.")
-    lit = ground[::_STEP, ::_STEP].max(axis=2) > _DARK  # a black surround tells nothing of the light
-    lit = lit if lit.any() else ~lit
-    thinned = (part[::_STEP, ::_STEP][lit] + 1.0 for part in (image, ground))
-    ground = cv2.multiply(ground, (*np.median(np.divide(*thinned), axis=0), 0.0))
+    where, ground = lit(ground), relit(ground, image)
     difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTHING * max(image.shape))
-    largest = np.percentile(np.abs(difference[::_STEP, ::_STEP][lit]).max(axis=1), _DIFFERENCE_PERCENTILE)
+    largest = np.percentile(np.abs(difference[::_STEP, ::_STEP][where]).max(axis=1), _DIFFERENCE_PERCENTILE)
     gain = float(np.clip(_TARGET_DIFFERENCE / max(largest, 1.0), *_GAIN_RANGE))
     # OpenCV clips at 0 and 255.
-    mean = np.full_like(difference, ground[::_STEP, ::_STEP][lit].mean(axis=0))
+    mean = np.full_like(difference, ground[::_STEP, ::_STEP][where].mean(axis=0))
     return cv2.addWeighted(difference, gain, mean, 1.0, 0.0, dtype=cv2.CV_8U)

@@ -91,6 +91,7 @@ class Live:
 class Recorder:
     """Writes the input and the output of a run: `input/` is a recording that can be run again, `frames.csv` has the results.
 
+    In `frames.csv` and `seconds.csv` frames have their numbers in `recording`; those of `input/` count from 0.
     Frames are written as they come, in a thread of their own.  A full disk ends the recording, but not the run.
 
     Args:
@@ -110,12 +111,16 @@ class Recorder:
         for name in ("recording.toml", "kinematics.csv"):
             shutil.copyfile(recording.folder / name, self.folder / "input" / name)
         self._source, self._patient, self._count = recording.folder, patient, 0
+        self._number: dict[int | None, int] = {}  # of each frame in its recording, by its index in the run
         self._queue: queue.Queue = queue.Queue(16)
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def add(self, arrival: Arrival, result: FrameResult) -> None:
         """Record a frame and its result."""
+        self._number[result.index] = arrival.source if arrival.source >= 0 else result.index
+        surface = self._number.get(result.reconstructed_at)
+        result = replace(result, index=self._number[result.index], reconstructed_at=surface)
         if not self.failure and not self._patient and self._queue.full():
             self.left_out += 1
         elif not self.failure:

@@ -4,11 +4,14 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Self
 
+import cv2
 import numpy as np
 
 _FRAMES = 9  # number of frames in the median; more take longer and hardly improve it
 _FEWEST = 5  # with fewer frames the tool may cover a place in most of them
 _APART = 0.5  # least distance between the tool's places in two of these frames, in units of its length
+_STEP = 4  # the light of an image is estimated on every fourth row and column
+_DARK = 8  # grey value up to which a pixel may belong to the black surround of a round field
 
 
 class Ground:
@@ -31,9 +34,10 @@ class Ground:
     def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self | None:
         """The median of those frames of a recording (`name`) between which the robot's tool x_mm (n, k, 3) moves farthest.
 
-        If the robot reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred.
-        None if fewer than five frames show the tool in different places.  The ground would then contain the tool, and frames
-        that do not show it there would seem to.
+        The frames are brought to one light before, else the brightest or the darkest would show the tool in it.  If the robot
+        reports fewer than three positions, the frames are evenly spaced.  What moves all the time is blurred.  None if fewer
+        than five frames show the tool in different places.  The ground would then contain the tool, and frames that do not
+        show it there would seem to.
         """
         chosen = apart(x_mm.mean(axis=1), _FRAMES, _APART * _length(x_mm))
         if len(chosen) < _FEWEST:
@@ -41,9 +45,9 @@ class Ground:
 
         def see() -> np.ndarray:
             sides = ([getattr(frames[int(i)], side) for i in chosen] for side in ("left", "right"))
-            return np.stack([_median(list(images)) for images in sides])
+            return np.stack([_median(images) for images in sides])
 
-        return cls(see, f"{name} {chosen.tolist()}")
+        return cls(see, f"{name} in one light {chosen.tolist()}")
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Self:
         """The ground of images that `change` has processed: the same change of the cameras' ground."""
@@ -55,9 +59,9 @@ class GrowingGround:
 
     >>> growing = GrowingGround()
     >>> for k in range(5):
-    ...     growing.take(np.full((2, 4, 6, 3), k, np.uint8), np.full((3, 3), float(k)))
+    ...     growing.take(np.full((2, 4, 6, 3), 90 + k, np.uint8), np.full((3, 3), float(k)))
     >>> growing.ground().max()
-    np.uint8(2)
+    np.uint8(90)
     """
 
     def __init__(self) -> None:
@@ -74,11 +78,33 @@ class GrowingGround:
             return
         self._kept, self._centre_mm = [images.copy() if i == new else self._kept[i] for i in chosen], centre_mm[chosen]
         if len(chosen) >= _FEWEST:
-            self.ground = Ground(partial(_median, self._kept), str(self._centre_mm.tolist()))
+            self.ground = Ground(partial(_of_pairs, self._kept), str(self._centre_mm.tolist()))
+
+
+def lit(image: np.ndarray) -> np.ndarray:
+    """Which pixels of every fourth row and column of an image (h, w, 3) tell of its light: a black surround does not."""
+    bright = image[::_STEP, ::_STEP].max(axis=2) > _DARK
+    return bright if bright.any() else ~bright
+
+
+def relit(image: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Scale each channel of an image (h, w, 3) uint8 RGB to the light of another one of the same scene.
+
+    >>> relit(np.full((8, 8, 3), 99, np.uint8), np.full((8, 8, 3), 49, np.uint8)).max()
+    np.uint8(50)
+    """
+    where = lit(image)
+    thinned = (part[::_STEP, ::_STEP][where] + 1.0 for part in (like, image))
+    return cv2.multiply(image, (*np.median(np.divide(*thinned), axis=0), 0.0))  # the median ignores the tool
+
+
+def _of_pairs(pairs: Sequence[np.ndarray]) -> np.ndarray:
+    return np.stack([_median(images) for images in zip(*pairs, strict=True)])
 
 
 def _median(images: Sequence[np.ndarray]) -> np.ndarray:
-    ranked, middle = list(images), len(images) // 2
+    """The median of images (h, w, 3) uint8 RGB in the light of the first one."""
+    ranked, middle = [relit(image, images[0]) for image in images], len(images) // 2
     for last in range(len(ranked) - 1, middle - 1, -1):  # move the maximum of 0 to `last` to `last`
         for i in range(last):
             ranked[i : i + 2] = np.minimum(*ranked[i : i + 2]), np.maximum(*ranked[i : i + 2])

@@ -182,7 +182,7 @@ class Recording:
         """The reasons why the recording is suspicious, although it can be read."""
         n, frame_s, log_s = len(self), self.frames.time_s + self.offset_s, self.kinematics.time_s
         span, logged, step = float(np.ptp(frame_s)), float(np.ptp(log_s)), np.diff(log_s)
-        uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
+        own_times = (self.folder / "frames.csv").exists()
         usual_s = float(np.median(step)) if len(step) else 0.0
         reported = np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1)
         covered = (frame_s >= log_s[0]) & (frame_s <= log_s[-1])
@@ -194,10 +194,10 @@ class Recording:
         steps = len(new) > _FEWEST_NEW and np.median(jump_mm[new]) > _STEPS * self.robot_accuracy_mm  # else it is a fine grid
         held_s = float(np.median(np.diff(log_s[new]))) if steps else 0.0
         repeats = held_s > max(_HELD_S, 1.5 * usual_s)
-        videos = [] if (self.folder / "frames.csv").exists() else self.folder.glob("*.mp4")
+        videos = [] if own_times else self.folder.glob("*.mp4")
         stated = [video_times(path) for path in videos if path.stem in SIDES]
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
-        longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
+        longer = not own_times and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in seconds? Log ten samples a second or more."),
@@ -325,6 +325,7 @@ class RecordingWriter:
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
         overwrite: Replace a recording of that name; any other existing folder is a FileExistsError.  Labels are kept if all
             frames are the same.  A `UserWarning` names the folder that keeps whatever else differs.
+        own_times: The times given are known, so that they are written even if they are uniform.
 
     >>> import tempfile
     >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
@@ -340,7 +341,7 @@ class RecordingWriter:
         self, folder: str | Path, *, name: str, fps: float, image_size_px: tuple[int, int], description: str = "",
         readout_s: float = 0.0, offset_s: float = 0.0, robot_accuracy_mm: float = 0.010,
         skeleton: Sequence[str] = LANDMARKS, details: Mapping[str, float | int | str] | None = None,
-        suffix: str = ".jpg", jpeg_quality: int = 90, overwrite: bool = False,
+        suffix: str = ".jpg", jpeg_quality: int = 90, overwrite: bool = False, own_times: bool = False,
     ) -> None:  # fmt: skip
         if suffix not in {".jpg", ".png"}:
             raise ValueError(f"suffix: '.jpg' or '.png', got {suffix!r}.")
@@ -357,6 +358,7 @@ class RecordingWriter:
         }  # fmt: skip
         self._details = dict(details or {})
         self._time_s: list[float] = []
+        self._own_times = own_times
         self._kinematics: list[np.ndarray] = []
         self._annotations: Annotations | None = None
 
@@ -412,7 +414,7 @@ class RecordingWriter:
             lines += ["", f"[{table}]", *toml_entries(values)] if values else []
         write_text(self.folder / "recording.toml", "\n".join(lines) + "\n")
         time = np.array(self._time_s)
-        if not np.allclose(time, np.arange(len(time)) / self.fps, rtol=0, atol=1e-7):
+        if self._own_times or not np.allclose(time, np.arange(len(time)) / self.fps, rtol=0, atol=1e-7):
             table = np.column_stack([np.arange(len(time)), time])
             write_table(self.folder / "frames.csv", ["frame", "time_s"], table, [0, 7])
         if self._kinematics:

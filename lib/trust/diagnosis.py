@@ -200,7 +200,7 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
     if 2 <= last - first <= 0.6 * case.frames:
         rows = (problem.frame >= first) & (problem.frame < last)
         when = "{} to {} ({:.2f} to {:.2f} s)".format(*problem.number[[first, last - 1]], *problem.time[rows][[0, -1]])
-        cure = "Look at these frames and at the robot's log of this time, or leave them out (--frames A:B)."
+        cure = "Look at these frames and the robot's log of this time, or leave its cells in kinematics.csv blank there."
         parts.append(("bad_stretch", rows, 4, f"Frames {when} have", cure))
     for name, rows, extra, what, cure in parts:
         inside, outside = problem.used & rows[:, None], problem.used & ~rows[:, None]

@@ -349,6 +349,9 @@ def assess(
         left, right = calibration.cameras
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
+    if calibration is not None:
+        straight = data = _in_view(data, calibration, recording.image_size_px)
+    if near:
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
@@ -372,6 +375,14 @@ def assess(
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
+
+
+def _in_view(data: Correspondences, c: Calibration, size_px: tuple[int, int]) -> Correspondences:
+    """The calibrated `data` without outliers in images that do not show the robot's tool: something else was found there."""
+    told_px = np.stack(c.pair.project(data.x_mm), axis=1)
+    outside = ((told_px < 0) | (told_px > np.array(size_px) - 1)).any(axis=2) & ~c.view_inliers
+    left, right = (np.where(away[:, None], np.nan, u) for away, u in zip(outside.T, (data.u_left, data.u_right), strict=True))
+    return replace(data, u_left=left, u_right=right)
 
 
 def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:

@@ -93,7 +93,9 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}
     if unknown := [name for name, _ in pairs if name not in known]:
-        raise ValueError(f"unknown parameter: {unknown[0]}. Declared are: {', '.join(sorted(known)) or 'none'}.")
+        elsewhere = ", ".join(book.stem for book in choose_notebooks() if unknown[0] in declared_parameters(book))
+        hint = f" Only other notebooks declare it: {elsewhere}." if elsewhere else ""
+        raise ValueError(f"unknown parameter: {unknown[0]}.{hint} Declared are: {', '.join(sorted(known)) or 'none'}.")
     if below := [text for name, text in pairs if name == "seed" and text.strip().startswith("-")]:
         raise ValueError(f"parameter seed: {below[0]} is below 0.")
     given = [("profile", profile), *pairs]

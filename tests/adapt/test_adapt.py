@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 import warnings
 from contextlib import nullcontext
 from dataclasses import replace
@@ -834,8 +835,10 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     pictures, outline = np.zeros((2, 141, 161, 3), np.uint8), np.full((2, 30, 2), 70.0)
     far_off = ShaftEnd(np.arange(3), np.full((3, 2, 2), 1e3), AHEAD, np.ones((3, 2, 2)), 5.0, 0.01, pictures, outline)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: far_off)
-    out = tmp_path / "better"
-    assert report.main([str(recording.folder), "--out", str(out), "--minutes", "1"]) == 0
+    lab, out = shutil.copytree(recording.folder, tmp_path / "lab"), tmp_path / "better"
+    header = (lab / "recording.toml").read_text(encoding="utf-8")
+    (lab / "recording.toml").write_text(header.replace("offset_s = 0.0\n", "offset_s = 0.1\n"), encoding="utf-8")
+    assert report.main([str(lab), "--out", str(out), "--minutes", "1"]) == 0
     content = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -846,6 +849,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     card = (out / "weights.md").read_text(encoding="utf-8")
     assert "Learning curve" in page and "| within 5 %, % |" in card and "standard deviations of" in card
     said = capsys.readouterr().out
+    assert f"offset_s is wrong by {1e3 * (content['offset_s'] - 0.1):.1f} ms, standard" in said
     assert f"set offset_s = {content['offset_s']:.4f} in " in said and "--weights" in said.splitlines()[-1]
     monkeypatch.setattr(Detector, "load", lambda *_, **__: lambda images: Landmarks.none(len(images)))
     assert report.main([str(recording.folder), "--out", str(tmp_path / "worse")]) == 3

@@ -166,6 +166,8 @@ def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
     log = next(entry for entry in first["sources"] if entry["file"] == "log.csv")
     assert log["sha256"] == hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
     assert "The mapping names no labels." in first["did"]
+    doubts = Recording.open(tmp_path / "one").doubts
+    assert "frame_times" not in {doubt.name for doubt in doubts}  # the video states its times, so a longer log is no wonder
 
 
 def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipped, tmp_path):
@@ -643,8 +645,9 @@ def test_a_wide_search_finds_a_clock_that_is_far_off(late_s, narrow_s, refused, 
     assert abs(clock["offset_s"] - late_s) < 5e-4 and clock["sd_s"] < 5e-4
     assert np.isfinite(Recording.open(tmp_path / "eye").landmarks_mm()).all()
     mapping.write_text(text.replace("[robot]\n", search.format(narrow_s)), "utf-8")
-    with pytest.raises(ValueError, match=refused):
+    with pytest.raises(ValueError, match=refused) as error:
         import_recording(folder, mapping, tmp_path / "two")
+    assert "reports a position in" not in str(error.value)  # that would be said of the offset where the search began
 
 
 def test_the_offsets_named_where_log_and_video_do_not_overlap_make_them_overlap(shipped, tmp_path):
@@ -748,6 +751,7 @@ def test_a_wrong_rate_of_frames_is_named_where_the_clock_is_beyond_its_search(mo
 
     monkeypatch.setattr(importer, "estimate_time_offset", beyond)
     recording = Recording.open(paths.SHIPPED_RECORDING)
-    fast = replace(recording, frames=Frames(None, None, np.arange(len(recording)) / recording.fps))
+    fast_s = np.arange(len(recording)) / recording.fps
+    fast = replace(recording, folder=Path("no frames.csv"), frames=Frames(None, None, fast_s))
     with pytest.raises(ValueError, match=r"at 25 fps last 1\.\d s, but the robot's log \d+\.\d s\..*frames\.csv"):
         importer._clock(fast, search_s=0.5)

@@ -193,6 +193,13 @@ def shut(folder: Path, text: str) -> str:
     return pose(tool="[tool]\nestimate = true\n")(folder, text)
 
 
+def rounded_times(folder: Path, text: str) -> str:
+    header, *rows = (folder / "log.csv").read_text("utf-8").splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    (folder / "log.csv").write_text("\n".join([header, *(f"{float(t):.0f},{rest}" for t, rest in cells)]), "utf-8")
+    return text
+
+
 def wrong_rotation(folder: Path, text: str) -> str:
     lines = (folder / "pose.tsv").read_text().splitlines()
     cells = lines[7].split("\t")
@@ -234,6 +241,7 @@ SPOILT = {
     "no time": (line(7, lambda row, _: "," + row.split(",", 1)[1]), r"log\.csv, line 8, column time_s: '' is not a time"),
     "decreasing times": (line(7, lambda row, lines: lines[2]), r"log\.csv, line 8: the time goes back \(.*Sort"),
     "repeated times": (line(7, lambda row, lines: lines[6]), r"log\.csv, line 8: the time repeats \(.*drop"),
+    "rounded times": (rounded_times, r"log\.csv, line \d: the time repeats .* rounded to 1 s\. .*more digits; .*spread"),
     "empty log": (edit("log.csv", lambda t: t.splitlines()[0] + "\n"), r"log\.csv: the table has no row"),
     "not UTF-8": (bytes_of("log.csv", b"time_s,\xff\n"), r"log\.csv, line 1: the text is not UTF-8"),
     "metres called mm": (edit("log.csv", lambda t: _scaled(t, 1e-3)), r"log\.csv.*length_unit"),

@@ -66,6 +66,20 @@ def test_a_replay_gives_the_same_bytes(tmp_path, shipped):
         Recorder(tmp_path / "first", shipped)
 
 
+def test_the_results_of_some_frames_have_their_numbers_in_the_recording(tmp_path, shipped):
+    recorder = Recorder(tmp_path, shipped)
+    for k, arrival in enumerate(recorded(shipped, range(4, 7))):
+        recorder.add(arrival, FrameResult(k, reconstructed_at=1 if k == 2 else None))
+    recorder.close()
+    results, spent, times = (
+        [line.split(",") for line in (tmp_path / name).read_text().splitlines()[1:]]
+        for name in ("frames.csv", "seconds.csv", "input/frames.csv")
+    )
+    assert [cells[0] for cells in results] == [cells[0] for cells in spent] == ["4", "5", "6"]
+    assert results[2][-2] == "5"  # the frame of the surface
+    assert [cells[0] for cells in times] == ["0", "1", "2"]
+
+
 def test_a_full_disk_ends_the_recording_and_not_the_run(tmp_path, shipped, monkeypatch):
     copies = []
 

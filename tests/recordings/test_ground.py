@@ -37,6 +37,20 @@ def test_a_long_rest_does_not_put_the_tool_into_it():
     assert (Ground.of_frames(frames(places), x_mm, "one")() != GROUND).any()
 
 
+def test_a_change_of_the_light_does_not_put_the_tool_into_it():
+    """Halfway the light grows: a median of four dim and five bright frames is dim where a bright one shows the tool."""
+    places = np.column_stack([np.arange(0, 27, 3), np.tile([0, 11, 22], 3)])
+    x_mm = np.repeat(np.column_stack([places, np.zeros(9)])[:, None], 3, axis=1)
+    shown = frames(places)
+    for frame in shown[4:]:
+        frame.left, frame.right = (np.rint(1.25 * side).astype(np.uint8) for side in (frame.left, frame.right))
+    growing = GrowingGround()
+    for frame, x in zip(shown, x_mm, strict=True):
+        growing.take(np.stack([frame.left, frame.right]), x)
+    for ground in (Ground.of_frames(shown, x_mm, "one"), growing.ground):
+        assert np.abs(ground().astype(int) - GROUND).max() <= 2
+
+
 def test_a_tool_that_hardly_moves_has_no_ground():
     """It rests at two places: in the median of such frames it is seen where the other frames do not show it."""
     rng, places = np.random.default_rng(0), np.array([[0, 0]] * 10 + [[20, 10]] * 8)

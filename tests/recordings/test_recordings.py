@@ -690,13 +690,16 @@ def test_frames_are_named_as_slices_are(text, frames):
     (40, np.arange(-0.1, 2, 0.01), 500.0, "jump"),
     (40, np.arange(-0.1, 2, 0.01), 0.0, None),
 ])  # fmt: skip
-def test_doubts(frames, times, jump, name):
+def test_doubts(frames, times, jump, name, tmp_path):
     log = Kinematics(times, np.zeros((len(times), 3, 3)))
     log.x_mm[2] += jump
     at = Frames(None, None, np.arange(frames) / 25)
-    recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
+    shipped = Recording.open(paths.SHIPPED_RECORDING)
+    recording = replace(shipped, folder=tmp_path, frames=at, fps=25.0, offset_s=0.0, kinematics=log)
     assert [doubt.name for doubt in recording.doubts] == ([name] if name else [])
     assert bool(recording.mistimed) == (name not in (None, "jump"))
+    (tmp_path / "frames.csv").touch()  # the recording states the times of its frames, as an import does that knows them
+    assert [doubt.name for doubt in replace(recording).doubts] == ([name] if name not in (None, "frame_times") else [])
 
 
 @pytest.mark.parametrize("named", [False, True])

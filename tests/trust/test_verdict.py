@@ -229,16 +229,31 @@ def test_a_base_that_the_detector_marks_along_the_shaft_is_told(decoded_once, mo
         assert 7.0 < float(re.search(r"marks the base ([\d.]+) % .* behind the end", named["base"])[1]) < 9.0
 
 
-def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(monkeypatch):
+@pytest.fixture
+def stub(monkeypatch):
+    """A near scene, a recording of it without pictures, and what the recording states."""
     monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
     monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
     scene = spoiling.Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
-    centre = (np.array(scene.image_size_px) - 1) / 2
-    far = [u - centre for u in (scene.data.u_left, scene.data.u_right)]
-    left, right = (centre + d * (1 + 8e-8 * (d**2).sum(axis=1, keepdims=True)) for d in far)
     stated = {key: getattr(scene, key) for key in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     recording = MagicMock(folder=Path("stub"), doubts=(), robot_accuracy_mm=0.01, **stated)
     recording.__len__.return_value = 60
+    return scene, recording, stated
+
+
+def test_what_is_found_while_the_robot_holds_the_tool_outside_the_images_is_no_fault_of_the_recording(stub):
+    scene, recording, _ = stub
+    away = (scene.data.frame >= 20) & (scene.data.frame < 32)
+    aside_mm = np.where(away[:, None], 40.0, 0.0) * ROBOT_FROM_MICROSCOPE.R[:, 0]
+    found = assess(recording, replace(scene.data, x_mm=scene.data.x_mm + aside_mm))
+    assert found.diagnosis.best is None and np.array_equal(found.data.seen.any(axis=1), ~away)
+
+
+def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(stub):
+    scene, recording, stated = stub
+    centre = (np.array(scene.image_size_px) - 1) / 2
+    far = [u - centre for u in (scene.data.u_left, scene.data.u_right)]
+    left, right = (centre + d * (1 + 8e-8 * (d**2).sum(axis=1, keepdims=True)) for d in far)
     data = replace(scene.data, u_left=left, u_right=right)
     assert diagnose(data, near=True, **stated).best is not None
     assert assess(recording, data, model="zero_skew+distance+radial").diagnosis.best is None

@@ -70,6 +70,8 @@ def test_a_parameter_reaches_only_who_declares_it(write_notebook, tmp_path):
     assert parse_parameters([("b", "2")], [one, two]) == {one: {}, two: {"b": 2}}
     with pytest.raises(ValueError, match=r"unknown parameter: c. Declared are: a, b\."):
         parse_parameters([("c", "2")], [one, two])
+    with pytest.raises(ValueError, match=r"unknown parameter: recording\. Only other notebooks declare it: .*03_.*\. "):
+        parse_parameters([("recording", "mine")], [one, two])
 
 
 def test_the_grid_stands_in_the_comments(write_notebook, tmp_path):
