@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lib.trust.clocks import stamps_err
 from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
 
 _FEWEST_FRAMES = 8
@@ -55,9 +56,8 @@ def unsteady(case: Case) -> Iterator[Hypothesis]:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
         if _is_distinct(case, found):
-            text = f"The time stamps of frames or log have independent errors of {1e3 * found.sd:.2g} ms (RMS)."
-            cure = "Record when the camera exposed each frame and when the robot measured each position; do not round."
-            yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
+            size = 1e3 * found.sd, 0.0, "ms"
+            yield case.found("time_stamps", found.fit, 1, size, *stamps_err(found.sd), raw=found.raw)
     shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
     zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
     sways = shift, 3.0, 1.0, "px", "image_sways", "shifts", "Fix that camera, and turn off image stabilisation."

@@ -391,14 +391,24 @@ def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
     assert best.name == "clock" and best.value == pytest.approx(20, abs=5)
 
 
-@pytest.mark.parametrize(("offset_s", "named"), [(0.025, "clock"), (0.0, None)])
-def test_a_clock_is_found_although_the_hand_trembles(offset_s, named):
-    scene = Scene(np.random.default_rng(7), frames=58, fps=2.5, speed_mm_s=2.0, offset_s=offset_s)
+def trembling(**options):
+    scene = Scene(np.random.default_rng(7), **{"frames": 58, "fps": 2.5, "speed_mm_s": 2.0} | options)
     steady, hertz = scene.path(), np.array([7.3, 9.1, 10.7])
     scene.path = lambda: lambda t: steady(t) + 0.15 * np.sin(2 * np.pi * hertz * t[..., None])[..., None, :]
-    best = found(scene.take()).best
+    return found(scene.take()).best
+
+
+@pytest.mark.parametrize(("offset_s", "named"), [(0.025, "clock"), (0.0, None)])
+def test_a_clock_is_found_although_the_hand_trembles(offset_s, named):
+    best = trembling(offset_s=offset_s)
     assert (best and best.name) == named
     assert best is None or best.value == pytest.approx(-25.0, abs=1.0)
+
+
+def test_rounded_times_are_found_although_the_hand_trembles():
+    late_s = np.random.default_rng(0).uniform(-0.05, 0.05, 58)
+    best = trembling(camera_late_s=(late_s, late_s))
+    assert best.name == "time_stamps" and best.value == pytest.approx(1e3 * late_s.std(), rel=0.3)
 
 
 @pytest.mark.parametrize("offset_s", [-2.1, 3.0])
