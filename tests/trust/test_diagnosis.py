@@ -305,6 +305,21 @@ def test_jaws_of_a_constant_opening_accuse_nobody(options):
     assert found(take(seed=1, frames=90, opening_mm=(1.0, 1.0001), **options)).best is None
 
 
+def _shutting(scene, t, x):
+    """The opening as an encoder counts it that runs the other way."""
+    across = x[:, 2] - x[:, 1]
+    across *= 0.5 * (1.7 / np.linalg.norm(across, axis=1, keepdims=True) - 2.0)
+    return x + across[:, None] * np.array([0.0, -1.0, 1.0])[:, None]
+
+
+@pytest.mark.parametrize("seed", [7, 8, 9])
+def test_a_jaw_signal_that_runs_the_other_way_is_told_from_exchanged_tips(seed):
+    scene = Scene(np.random.default_rng(seed), frames=40, fps=15.0, speed_mm_s=6.0)
+    scene.edit_report.append(_shutting)
+    best = found(scene.take()).best
+    assert best.name == "jaw_opening" and "other way" in best.text and best.value == pytest.approx(-1.0, abs=0.1)
+
+
 def test_an_opening_that_hardly_changes_is_not_accused_where_offsets_cancel_it():
     options = {"frames": 15, "fps": 2.5, "opening_mm": (0.22, 0.42), "noise_px": 1.5, "bias_mm": 0.05, "memory": 0.9}
     assert found(take(seed=17, **options)).best is None
