@@ -17,6 +17,7 @@ _WORTH = 20.0  # gain in log likelihood by another clock or order from which the
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
+_ASTRAY = 10.0  # largest residual of frames of other instants, over the scale; at no instant do wrong detections fit so well
 #: The cure if one camera's images belong to other instants.
 PAIR_AGAIN = "Look for images that one camera lost, and pair left and right images of one instant."
 
@@ -122,6 +123,9 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         astray = np.abs(shifts[own]) > step / 2
         others, first = 1e3 * shifts[own][astray], case.problem.number[astray.argmax()]
         if len(others) < 3:  # these may be spikes of the log
+            continue
+        rows = moved.used & astray[moved.frame][:, None] & np.isin((0, 1), views)
+        if np.median(np.linalg.norm(fit.residuals, axis=2)[rows]) > _ASTRAY * fit.shapes[0].scale:
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"

@@ -22,7 +22,7 @@ from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
-from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, is_constant
+from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, ROBOT_ERRS, is_constant
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # most rows that are used; three frames leave nothing to check against
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
@@ -341,7 +341,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     if epipolar < 0.25 * missed and missed > case.robot_mm * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
         text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px."
-        cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
+        cure = f"{ROBOT_ERRS} Or the detector errs alike in both images: see its overlays."
         explained = (share if off is far else 1.0) * (1.0 - (epipolar / missed) ** 2)
         gain = float(gain if off is far else half * np.log(missed / epipolar) / fit.design)
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]

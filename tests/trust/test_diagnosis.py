@@ -420,6 +420,17 @@ def test_a_clock_is_found_although_the_hand_trembles(offset_s, named):
     assert best is None or best.value == pytest.approx(-25.0, abs=1.0)
 
 
+def _hidden(scene, u):
+    """Nine frames in which the tool is out of view, and the detector marks something at rest."""
+    gone = u[27] + 300.0 + scene.rng.normal(0, 3, (9, *u.shape[1:]))
+    return np.concatenate([u[:27], gone, u[36:]])
+
+
+def test_detections_of_a_tool_out_of_view_belong_to_no_other_instant():
+    best = trembling(edit_pixels=[_hidden])
+    assert best.name == "bad_stretch" and "Frames 27 to 35" in best.text
+
+
 def test_rounded_times_are_found_although_the_hand_trembles():
     late_s = np.random.default_rng(0).uniform(-0.05, 0.05, 58)
     best = trembling(camera_late_s=(late_s, late_s))
@@ -485,6 +496,7 @@ def test_images_that_agree_accuse_no_detector():
         usual.data.time_s + usual.offset_s + late_s, usual.data.landmark, strict=True)])  # fmt: skip
     best = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).best
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
+    assert "depend on its position" in best.cure and "inverse" in best.cure
 
 
 @pytest.mark.parametrize(("landmark", "factor"), [(0, 1000.0), (2, 1000.0), (1, 0.1), (2, 0.001)])
