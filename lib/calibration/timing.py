@@ -85,7 +85,10 @@ class Paths:
             # The motion is smooth within 0.1 s, so a dropped sample is bridged; a longer gap is not.
             gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S[0], 2.5 * step)) + 1
             parts = [part for part in zip(np.split(time, gaps), np.split(x, gaps), strict=True) if len(part[0]) >= 4]
-            spacings = sorted({max(2, int(np.ceil(smooth_s / step))) for smooth_s in _SMOOTH_S}, reverse=True)
+            # Where a log repeats positions, a fine spline would follow its steps.
+            new = time[1:][(np.diff(x, axis=0) != 0).any(axis=1)]
+            finest_s = min(2.0 * float(np.median(np.diff(new))) if len(new) > 1 else np.inf, _SMOOTH_S[0])
+            spacings = [max(2, int(np.ceil(smooth_s / step))) for smooth_s in _SMOOTH_S if smooth_s >= finest_s]
             fits = [_splines(parts, every) for every in spacings]
             every, (pieces, noise) = next(f for f in zip(spacings, fits, strict=True) if f[1][1] <= _LOST * fits[-1][1])
             self.pieces.append(pieces)

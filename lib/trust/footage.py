@@ -49,7 +49,8 @@ def _interlaced(best: Hypothesis, recording: Recording, data: Correspondences) -
 
 def _jagged(image: np.ndarray) -> float:
     """How much each row differs from both its neighbours alike."""
-    return float(np.maximum((image[1:-1] - image[:-2]) * (image[1:-1] - image[2:]), 0).mean()) if len(image) > 2 else 0.0
+    both = (image[1:-1] - image[:-2]) * (image[1:-1] - image[2:])
+    return float(np.maximum(both, 0).mean()) if both.size else 0.0
 
 
 def _repeated(best: Hypothesis, recording: Recording, data: Correspondences) -> Hypothesis | None:
@@ -58,8 +59,8 @@ def _repeated(best: Hypothesis, recording: Recording, data: Correspondences) -> 
     starts = np.linspace(first, max(last - _STRETCH + 1, first), _STRETCHES).astype(int)
     pairs = np.unique(np.concatenate([np.arange(start + 1, min(start + _STRETCH, last + 1)) for start in starts]))
     changes = [cv2.absdiff(recording.frames[int(i)].left, recording.frames[int(i) - 1].left).mean() for i in pairs]
-    steps_mm = np.linalg.norm(np.diff(recording.landmarks_mm(), axis=0), axis=2).max(axis=1)[pairs - 1]
-    moves = steps_mm > _MOVES * np.nanmedian(steps_mm)
+    steps_mm = np.nan_to_num(np.linalg.norm(np.diff(recording.landmarks_mm(), axis=0), axis=2)).max(axis=1)[pairs - 1]
+    moves = steps_mm > _MOVES * np.median(steps_mm)
     twice = moves & (changes < _SAME * np.quantile(changes, 0.9))
     if twice.sum() < max(2, _LEAST_REPEATED * moves.sum()):
         return None

@@ -320,6 +320,10 @@ def test_a_jaw_signal_that_runs_the_other_way_is_told_from_exchanged_tips(seed):
     assert best.name == "jaw_opening" and "other way" in best.text and best.value == pytest.approx(-1.0, abs=0.1)
 
 
+def test_a_log_that_repeats_positions_shows_that_its_times_err():
+    assert found(take("log holds positions", "80 ms", seed=31)).best.name == "time_stamps"
+
+
 def test_an_opening_that_hardly_changes_is_not_accused_where_offsets_cancel_it():
     options = {"frames": 15, "fps": 2.5, "opening_mm": (0.22, 0.42), "noise_px": 1.5, "bias_mm": 0.05, "memory": 0.9}
     assert found(take(seed=17, **options)).best is None
