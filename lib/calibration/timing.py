@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.stats import chi2
 
 from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.calibration import Calibration
@@ -51,14 +52,17 @@ def _velocity_gain(every: int) -> float:
 
 
 def _splines(parts: list[tuple[np.ndarray, np.ndarray]], every: int) -> tuple[list[BSpline], float]:
-    """Least-squares splines of (times, positions) with a knot for each `every` samples, and the sd of their residuals."""
-    pieces, squares, freedom = [], 0.0, 1.0
+    """Least-squares splines of (times, positions) with a knot for each `every` samples, and the sd of a coordinate's noise.
+
+    The sd follows from a quantile of the residuals, since a single spike of the log may outweigh all other samples.
+    """
+    pieces, sizes = [], [np.zeros(1)]
     for t, x in parts:
         knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
         pieces.append(make_lsq_spline(t, x, knots, k=3, method="norm-eq"))
-        squares += ((x - pieces[-1](t)) ** 2).sum()
-        freedom += 3 * (len(t) - len(pieces[-1].c))
-    return pieces, float(np.sqrt(squares / freedom))
+        freedom = max(len(t) - len(pieces[-1].c), 1) / len(t)
+        sizes.append(np.linalg.norm(x - pieces[-1](t), axis=1) / np.sqrt(freedom))
+    return pieces, float(np.quantile(np.concatenate(sizes), 0.75) / np.sqrt(chi2.ppf(0.75, 3)))
 
 
 class Paths:
