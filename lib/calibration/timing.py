@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.stats import chi2
 
 from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.calibration import Calibration
@@ -20,7 +21,9 @@ from lib.recordings import Kinematics
 _GRID = 41  # number of trial offsets in the coarse search
 #: Wider searches start with a scan, which needs few rows and leaves a search of the half width `_LEFT_S`.
 _WIDE_S, _LEFT_S, _SCAN_S, _SCAN_ROWS = 1.0, 0.5, 0.02, 400
-_SMOOTH_S = 0.1  # the robot's motion is smooth within this time
+#: Knot spacings of `Paths`, coarsest first: a robot's motion is smooth within 0.1 s, unless the hand that guides it trembles.
+_SMOOTH_S = (0.1, 0.05, 0.025)
+_LOST = 1.2  # residuals of a coarser spline over those of the finest, above which it loses motion, not only the log's noise
 #: A minimum of the misfit is clear if it is this far below the median trial in each camera; then landmarks may have constant
 #: offsets.  The second number is the largest residual with such offsets, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
@@ -48,10 +51,25 @@ def _velocity_gain(every: int) -> float:
     return float(np.sqrt((slopes * np.linalg.solve(basis(time).T @ basis(time), slopes.T).T).sum(axis=1).mean()))
 
 
-class Paths:
-    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, one for each stretch without a gap.
+def _splines(parts: list[tuple[np.ndarray, np.ndarray]], every: int) -> tuple[list[BSpline], float]:
+    """Least-squares splines of (times, positions) with a knot for each `every` samples, and the sd of a coordinate's noise.
 
-    At 100 Hz the derivative of an interpolating spline is mostly encoder noise, which would bias a regression on it.
+    The sd follows from a quantile of the residuals, since a single spike of the log may outweigh all other samples.
+    """
+    pieces, sizes = [], [np.zeros(1)]
+    for t, x in parts:
+        knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
+        pieces.append(make_lsq_spline(t, x, knots, k=3, method="norm-eq"))
+        freedom = max(len(t) - len(pieces[-1].c), 1) / len(t)
+        sizes.append(np.linalg.norm(x - pieces[-1](t), axis=1) / np.sqrt(freedom))
+    return pieces, float(np.quantile(np.concatenate(sizes), 0.75) / np.sqrt(chi2.ppf(0.75, 3)))
+
+
+class Paths:
+    """The landmarks' motion as least-squares cubic splines, one for each stretch without a gap.
+
+    At 100 Hz the derivative of an interpolating spline is mostly encoder noise, which would bias a regression on it.  So
+    a landmark's splines have the widest spacing of knots in `_SMOOTH_S` that leaves hardly more residuals than the finest.
     `samples` has for each landmark the times (m,) s, and the positions (m, 3) mm, NaN where the robot reports none.
     `velocity_sd` are the standard deviations, mm/s, of a coordinate of the landmarks' velocities that the log's noise causes.
 
@@ -65,21 +83,20 @@ class Paths:
         self.pieces: list[list[BSpline]] = []  # for each landmark
         self.velocity_sd = np.zeros(0)
         for time, x in samples:
-            self.pieces.append([])
-            squares, freedom = 0.0, 1.0
             known = np.isfinite(x).all(axis=1)
             time, x = time[known], x[known]
             step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-            every = max(2, int(np.ceil(_SMOOTH_S / step)))
             # The motion is smooth within 0.1 s, so a dropped sample is bridged; a longer gap is not.
-            gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
-            for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
-                if len(t) >= 4:
-                    knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
-                    self.pieces[-1].append(make_lsq_spline(t, part, knots, k=3, method="norm-eq"))
-                    squares += ((part - self.pieces[-1][-1](t)) ** 2).sum()
-                    freedom += 3 * (len(t) - len(self.pieces[-1][-1].c))
-            self.velocity_sd = np.append(self.velocity_sd, np.sqrt(squares / freedom) * _velocity_gain(every) / step)
+            gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S[0], 2.5 * step)) + 1
+            parts = [part for part in zip(np.split(time, gaps), np.split(x, gaps), strict=True) if len(part[0]) >= 4]
+            # Where a log repeats positions, a fine spline would follow its steps.
+            new = time[1:][(np.diff(x, axis=0) != 0).any(axis=1)]
+            finest_s = min(2.0 * float(np.median(np.diff(new))) if len(new) > 1 else np.inf, _SMOOTH_S[0])
+            spacings = [max(2, int(np.ceil(smooth_s / step))) for smooth_s in _SMOOTH_S if smooth_s >= finest_s]
+            fits = [_splines(parts, every) for every in spacings]
+            every, (pieces, noise) = next(f for f in zip(spacings, fits, strict=True) if f[1][1] <= _LOST * fits[-1][1])
+            self.pieces.append(pieces)
+            self.velocity_sd = np.append(self.velocity_sd, noise * _velocity_gain(every) / step)
 
     @property
     def span_s(self) -> float:
@@ -109,7 +126,7 @@ def estimate_time_offset(
     Args:
         data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
         kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), sampled densely enough for
-            the motion; their noise is averaged over 0.1 s.  NaN = no report; rows in longer gaps are dropped.
+            the motion; their noise is averaged over up to 0.1 s.  NaN = no report; rows in longer gaps are dropped.
         start_s, search_s: Middle and half width of the search.  A wide one may lead beyond the ends of the kinematics.
 
     A `DataError` refuses fewer than eight instants inside the kinematics, a tool that hardly moves, rows that agree on no

@@ -16,6 +16,8 @@ _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras 
 _WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
+_STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
+_ASTRAY = 10.0  # largest residual of frames of other instants, over the scale; at no instant do wrong detections fit so well
 #: The cure if one camera's images belong to other instants.
 PAIR_AGAIN = "Look for images that one camera lost, and pair left and right images of one instant."
 
@@ -117,10 +119,13 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     for views in ((0, 1), (0,), (1,)):
         if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:
             continue  # images of this camera repeat; `frozen_video` tests that
-        fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
+        fit, moved, own, raw = _chosen(case, shifts, views)
         astray = np.abs(shifts[own]) > step / 2
         others, first = 1e3 * shifts[own][astray], case.problem.number[astray.argmax()]
         if len(others) < 3:  # these may be spikes of the log
+            continue
+        rows = moved.used & astray[moved.frame][:, None] & np.isin((0, 1), views)
+        if np.median(np.linalg.norm(fit.residuals, axis=2)[rows]) > _ASTRAY * fit.shapes[0].scale:
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"
@@ -130,11 +135,36 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
         if len(views) == 1:
             cure = PAIR_AGAIN
-        counts = np.bincount(own, minlength=len(shifts)) / case.frames
-        penalty = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # entropy of the choices
-        penalty += 0.5 * np.count_nonzero(counts) * np.log(case.frames)  # BIC of their frequencies
-        raw, size = fit.total - case.null.total - penalty, (100 * share, 0.0, "%")
+        size = 100 * share, 0.0, "%"
         yield case.found("frame_order", fit, 1, size, text, cure, on=moved, raw=raw, images=views)
+
+
+def _chosen(case: Case, shifts: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray, float]:
+    """The fit with the best of `shifts` (s) for each frame, its rows, the choices (frames,), and the gain in likelihood."""
+    fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
+    counts = np.bincount(own, minlength=len(shifts)) / case.frames
+    penalty = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # entropy of the choices
+    penalty += 0.5 * np.count_nonzero(counts) * np.log(case.frames)  # BIC of their frequencies
+    return fit, moved, own, fit.total - case.null.total - penalty
+
+
+def _time_stamps(case: Case) -> Iterator[Hypothesis]:
+    """Times of the frames with errors of their own, so large that a trembling tool turns back meanwhile."""
+    if case.frames < 8:
+        return
+    tried = [np.linspace(-half_s, half_s, _STAMPS) for half_s in _STAMPS_S]
+    shifts, (fit, moved, own, raw) = max(((shifts, _chosen(case, shifts)) for shifts in tried), key=lambda one: one[1][3])
+    errors_s = shifts[own] - shifts[own].mean()
+    if np.median(np.abs(errors_s)) > 0.5 * errors_s.std():  # else only some frames err, as by wrong detections
+        sd_s = float(errors_s.std())
+        yield case.found("time_stamps", fit, 1, (1e3 * sd_s, 0.0, "ms"), *stamps_err(sd_s), on=moved, raw=raw)
+
+
+def stamps_err(sd_s: float) -> tuple[str, str]:
+    """Text and cure of times with independent errors."""
+    text = f"The time stamps of frames or log have independent errors of {1e3 * sd_s:.2g} ms (RMS)."
+    cure = "Record when the camera exposed each frame and when the robot measured each position; do not round. Did a program "
+    return text, cure + "change the frame rate? It repeats or drops images: export the camera's own."
 
 
 def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
@@ -205,4 +235,4 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
 
 
 #: Tests that need the tool's path over time (`Case.paths`).
-TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _smoothed_log, _backlash, _readout)
+TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _time_stamps, _smoothed_log, _backlash, _readout)

@@ -22,7 +22,7 @@ from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
-from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, is_constant
+from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, ROBOT_ERRS, is_constant
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # most rows that are used; three frames leave nothing to check against
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
@@ -125,14 +125,18 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
 
 
 def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
-    """Tips whose distance is the reported one times a factor.  With a constant opening this would only be an offset."""
+    """Tips whose distance is the reported one times a factor, or a constant minus the reported one.
+
+    With a constant opening this would only be an offset.
+    """
     tips = case.by_frame(case.problem.x[:, 0])[:, 1:]
-    width = np.linalg.norm(tips[:, 1] - tips[:, 0], axis=1)
-    width = width[np.isfinite(width)]
+    across = tips[:, 1] - tips[:, 0]
+    each = np.linalg.norm(across, axis=1)
+    width = each[np.isfinite(each)]
     if case.problem.landmark.max() != 2 or not len(width) or is_constant(width):
         return
     share = np.array([0.0, -0.5, 0.5])[case.problem.landmark]
-    half = (tips[:, 1] - tips[:, 0])[case.problem.frame] * share[:, None]
+    half = across[case.problem.frame] * share[:, None]
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None])
     factor, sd = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
     # Where the opening changes little, factor and offsets may cancel; then the factor without offsets is near 1.
@@ -144,6 +148,13 @@ def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
         text = f"In the images the tips are {factor:.2f} +- {sd:.2f} times as far apart as in the robot's report."
         cure = "Does the robot's log state the opening of one jaw or of both? Check that, and the length of the jaws."
         yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
+    halves = np.stack([half, half / np.maximum(each, 1e-9)[case.problem.frame, None]], axis=2)
+    fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], halves))
+    slope, sd, shut = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0])), float(fit.theta[1])
+    if slope + 3.0 * sd < 0.0 < shut + slope * np.median(width):  # the median is below 0 if the tips are exchanged
+        text = f"The jaw's signal runs the other way: tips that the robot reports {-shut / slope:.2f} mm apart are shut."
+        cure = "Reverse the opening of the jaws in the robot's log, or their angle: it shrinks where the images show it grow."
+        yield case.found("jaw_opening", fit, 2, (slope, sd, "times"), text, cure)
 
 
 def _log_spikes(case: Case) -> Iterator[Hypothesis]:
@@ -330,7 +341,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     if epipolar < 0.25 * missed and missed > case.robot_mm * zoom:
         what = f"In {100 * share:.0f} % of the landmarks" if off is far else "In most landmarks"
         text = f"{what} the images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px."
-        cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
+        cure = f"{ROBOT_ERRS} Or the detector errs alike in both images: see its overlays."
         explained = (share if off is far else 1.0) * (1.0 - (epipolar / missed) ** 2)
         gain = float(gain if off is far else half * np.log(missed / epipolar) / fit.design)
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]

@@ -10,12 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lib.trust.clocks import stamps_err
 from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
 
 _FEWEST_FRAMES = 8
 _ROUNDS, _STEPS = 8, 10  # of the alternation between cameras and parameters; of the parameters' sd with given cameras
 _GROWS = 1.02  # growth of the pixels' shift in a round, below which the rounds end while it is within the detector's error
 _OF_ZOOM = 0.6  # least shift by a zoom over the detector's error: less than 1, as shared errors hardly look like a zoom
+#: What to check if the images agree with each other and miss the robot.
+ROBOT_ERRS = (
+    "Check times, units, columns of kinematics.csv; the robot's accuracy, which may depend on its position; "
+    "and how its poses become points: the tool's transform, and the convention of rotations (or are they inverse?)."
+)
 _MOST = 0.5  # least median size of the parameters over their RMS: gross errors only affect a part of the frames
 
 
@@ -49,15 +55,14 @@ def unsteady(case: Case) -> Iterator[Hypothesis]:
     moves = max(np.ptp(x, axis=0).max() for x in each) > case.robot_mm
     if moves and _is_distinct(case, found) and size > case.robot_mm:
         text = f"From frame to frame images and robot differ by {size:.2g} mm (RMS), equally for all landmarks."
-        cure = "Fix the microscope and the robot's base; check times, units and columns of kinematics.csv."
+        cure = f"Fix the microscope and the robot's base. {ROBOT_ERRS}"
         yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
     if moves and case.paths:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
         if _is_distinct(case, found):
-            text = f"The time stamps of frames or log have independent errors of {1e3 * found.sd:.2g} ms (RMS)."
-            cure = "Record when the camera exposed each frame and when the robot measured each position; do not round."
-            yield case.found("time_stamps", found.fit, 1, (1e3 * found.sd, 0.0, "ms"), text, cure, raw=found.raw)
+            size = 1e3 * found.sd, 0.0, "ms"
+            yield case.found("time_stamps", found.fit, 1, size, *stamps_err(found.sd), raw=found.raw)
     shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
     zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
     sways = shift, 3.0, 1.0, "px", "image_sways", "shifts", "Fix that camera, and turn off image stabilisation."

@@ -20,6 +20,7 @@ from lib.recordings import Doubt, Recording, Scene
 from lib.trust.clocks import PAIR_AGAIN
 from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
 from lib.trust.fitting import SIDES
+from lib.trust.footage import with_footage
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -355,7 +356,7 @@ def assess(
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
-    diagnosis = with_scene(diagnosis, recording, data.frame)
+    diagnosis = with_footage(with_scene(diagnosis, recording, data.frame), recording, data)
     found = health(recording, data, calibration, detector=detector)
     shaft, best = None, diagnosis.best
     if detector is not None and calibration is not None and (best is None or best.name in ("landmark_offset", *OF_DETECTOR)):

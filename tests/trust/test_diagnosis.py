@@ -305,6 +305,25 @@ def test_jaws_of_a_constant_opening_accuse_nobody(options):
     assert found(take(seed=1, frames=90, opening_mm=(1.0, 1.0001), **options)).best is None
 
 
+def _shutting(scene, t, x):
+    """The opening as an encoder counts it that runs the other way."""
+    across = x[:, 2] - x[:, 1]
+    across *= 0.5 * (1.7 / np.linalg.norm(across, axis=1, keepdims=True) - 2.0)
+    return x + across[:, None] * np.array([0.0, -1.0, 1.0])[:, None]
+
+
+@pytest.mark.parametrize("seed", [7, 8, 9])
+def test_a_jaw_signal_that_runs_the_other_way_is_told_from_exchanged_tips(seed):
+    scene = Scene(np.random.default_rng(seed), frames=40, fps=15.0, speed_mm_s=6.0)
+    scene.edit_report.append(_shutting)
+    best = found(scene.take()).best
+    assert best.name == "jaw_opening" and "other way" in best.text and best.value == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_log_that_repeats_positions_shows_that_its_times_err():
+    assert found(take("log holds positions", "80 ms", seed=31)).best.name == "time_stamps"
+
+
 def test_an_opening_that_hardly_changes_is_not_accused_where_offsets_cancel_it():
     options = {"frames": 15, "fps": 2.5, "opening_mm": (0.22, 0.42), "noise_px": 1.5, "bias_mm": 0.05, "memory": 0.9}
     assert found(take(seed=17, **options)).best is None
@@ -391,6 +410,37 @@ def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
     assert best.name == "clock" and best.value == pytest.approx(20, abs=5)
 
 
+def trembling(**options):
+    scene = Scene(np.random.default_rng(7), **{"frames": 58, "fps": 2.5, "speed_mm_s": 2.0} | options)
+    steady, hertz = scene.path(), np.array([7.3, 9.1, 10.7])
+    scene.path = lambda: lambda t: steady(t) + 0.15 * np.sin(2 * np.pi * hertz * t[..., None])[..., None, :]
+    return found(scene.take()).best
+
+
+@pytest.mark.parametrize(("offset_s", "named"), [(0.025, "clock"), (0.0, None)])
+def test_a_clock_is_found_although_the_hand_trembles(offset_s, named):
+    best = trembling(offset_s=offset_s)
+    assert (best and best.name) == named
+    assert best is None or best.value == pytest.approx(-25.0, abs=1.0)
+
+
+def _hidden(scene, u):
+    """Nine frames in which the tool is out of view, and the detector marks something at rest."""
+    gone = u[27] + 300.0 + scene.rng.normal(0, 3, (9, *u.shape[1:]))
+    return np.concatenate([u[:27], gone, u[36:]])
+
+
+def test_detections_of_a_tool_out_of_view_belong_to_no_other_instant():
+    best = trembling(edit_pixels=[_hidden])
+    assert best.name == "bad_stretch" and "Frames 27 to 35" in best.text
+
+
+def test_rounded_times_are_found_although_the_hand_trembles():
+    late_s = np.random.default_rng(0).uniform(-0.05, 0.05, 58)
+    best = trembling(camera_late_s=(late_s, late_s))
+    assert best.name == "time_stamps" and best.value == pytest.approx(1e3 * late_s.std(), rel=0.3)
+
+
 @pytest.mark.parametrize("offset_s", [-2.1, 3.0])
 def test_a_clock_that_is_off_by_seconds_is_found_where_log_and_video_still_overlap(offset_s):
     clock = found(take(offset_s=offset_s, frames=60)).best
@@ -450,6 +500,7 @@ def test_images_that_agree_accuse_no_detector():
         usual.data.time_s + usual.offset_s + late_s, usual.data.landmark, strict=True)])  # fmt: skip
     best = found(replace(usual, data=replace(usual.data, x_mm=x_mm))).best
     assert best.name == "robot_noise" and re.match(r"In \d+ % of the landmarks the images agree", best.text)
+    assert "depend on its position" in best.cure and "inverse" in best.cure
 
 
 @pytest.mark.parametrize(("landmark", "factor"), [(0, 1000.0), (2, 1000.0), (1, 0.1), (2, 0.001)])

@@ -1,0 +1,81 @@
+"""What a recording's files say of a cause that looks like wrong times: interlaced or repeated images, or rounded times."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from lib.correspondences import Correspondences
+from lib.recordings import Recording
+from lib.trust.diagnosis import Diagnosis
+from lib.trust.fitting import Hypothesis
+from lib.trust.health import spread
+
+#: Causes that can be the effect of what this module looks for.
+_OF_TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "smoothed_log", "frozen_video")
+_LOOKED_AT, _AROUND = 8, 0.3  # images in which combs are looked for; margin around the tool, as a share of its extent
+_COMBED = 3.0  # least ratio of jagged rows to jagged columns; in images of one instant it is 0.9 to 1.8
+_STRETCHES, _STRETCH = 3, 13  # stretches of consecutive images that are compared, and their lengths
+#: An image repeats if it differs from the one before by less than the first share of the usual change, although the robot
+#: moved by more than the second share of its usual step.  Fewer repeats than the last share do little harm.
+_SAME, _MOVES, _LEAST_REPEATED = 0.1, 0.5, 0.05
+_UNITS_S = (1.0, 0.1, 0.01)  # units to which times may be rounded
+
+
+def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:
+    """The diagnosis of `data`; a defect of images or frame times replaces the cause of wrong times that it looks like."""
+    best = diagnosis.best
+    if best is None or best.name not in _OF_TIMES:
+        return diagnosis
+    found = _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
+    return Diagnosis((found, *(h for h in diagnosis.hypotheses if h.name != best.name))) if found else diagnosis
+
+
+def _interlaced(best: Hypothesis, recording: Recording, data: Correspondences) -> Hypothesis | None:
+    """Odd rows of another instant than even rows: edges of the moving tool become combs, jagged from row to row."""
+    frames, u, ratios = np.unique(data.frame), data.grid("u_left"), []
+    for i in spread(len(frames), _LOOKED_AT):
+        if np.isfinite(u[i]).all():
+            margin = _AROUND * np.ptp(u[i], axis=0).max() * np.array([[-1], [1]])
+            (left, top), (right, bottom) = np.maximum([u[i].min(axis=0), u[i].max(axis=0)] + margin, 0).astype(int)
+            tool = recording.frames[int(frames[i])].left[top:bottom, left:right].sum(axis=2, dtype=np.float32)
+            ratios.append(_jagged(tool) / max(_jagged(tool.T), 1e-9))
+    if not ratios or np.median(ratios) < _COMBED:
+        return None
+    text = "The images are interlaced: their odd rows show the tool at another instant than their even rows."
+    cure = "Deinterlace the videos: keep the even rows, fill in the odd ones from them (ffmpeg's filter yadif), import again."
+    return replace(best, name="interlaced", text=text, cure=cure, value=float(np.median(ratios)), sd=0.0, unit="times")
+
+
+def _jagged(image: np.ndarray) -> float:
+    """How much each row differs from both its neighbours alike."""
+    both = (image[1:-1] - image[:-2]) * (image[1:-1] - image[2:])
+    return float(np.maximum(both, 0).mean()) if both.size else 0.0
+
+
+def _repeated(best: Hypothesis, recording: Recording, data: Correspondences) -> Hypothesis | None:
+    """Images that a converter or camera delivered twice, as when 25 frames per second become 30."""
+    first, last = int(data.frame.min()), int(data.frame.max())
+    starts = np.linspace(first, max(last - _STRETCH + 1, first), _STRETCHES).astype(int)
+    pairs = np.unique(np.concatenate([np.arange(start + 1, min(start + _STRETCH, last + 1)) for start in starts]))
+    changes = [cv2.absdiff(recording.frames[int(i)].left, recording.frames[int(i) - 1].left).mean() for i in pairs]
+    steps_mm = np.nan_to_num(np.linalg.norm(np.diff(recording.landmarks_mm(), axis=0), axis=2)).max(axis=1)[pairs - 1]
+    moves = steps_mm > _MOVES * np.median(steps_mm)
+    twice = moves & (changes < _SAME * np.quantile(changes, 0.9))
+    if twice.sum() < max(2, _LEAST_REPEATED * moves.sum()):
+        return None
+    share = 100.0 * float(twice.sum() / moves.sum())
+    text = f"{share:.0f} % of the images repeat the one before while the robot moves, first that of frame {pairs[twice][0]}."
+    cure = "Drop images that came twice, as from 25 to 30 frames per second, and write the others' true times to frames.csv."
+    return replace(best, name="frozen_video", text=text, cure=cure, value=share, sd=0.0, unit="%", images=(0, 1))
+
+
+def _rounded(best: Hypothesis, recording: Recording) -> Hypothesis | None:
+    """Uneven times that are multiples of a coarse unit, and errors of the size of its rounding."""
+    time_s = recording.frames.time_s
+    unit_s = next((unit_s for unit_s in _UNITS_S if np.abs(time_s - unit_s * np.rint(time_s / unit_s)).max() < 1e-6), 0.0)
+    uneven = len(np.unique(np.rint(np.diff(time_s) / (unit_s or 1.0)))) > 1
+    if best.name != "time_stamps" or not uneven or not 0.1 * unit_s < 1e-3 * best.value < 0.5 * unit_s:
+        return None
+    text = f"The frames' times are rounded to {unit_s:g} s, and err by up to {500 * unit_s:g} ms."
+    return replace(best, text=text, cure="Write the frames' times to frames.csv as they were measured, to the millisecond.")

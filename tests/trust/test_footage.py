@@ -1,0 +1,67 @@
+"""Interlaced or repeated images and rounded times are told from the wrong clock that they look like."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.correspondences import of_recording
+from lib.recordings import Frames, Recording
+from lib.trust import Diagnosis, Hypothesis
+from lib.trust.footage import with_footage
+
+CLOCK = Hypothesis("clock", "10 ms", "Set offset_s.", 10.0, 1.0, "ms", explained=0.8, gain=90.0)
+STAMPS = replace(CLOCK, name="time_stamps", value=30.0)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """The recording that ships, with its left images for both eyes, decoded once at their full size."""
+    shipped = Recording.open(paths.SHIPPED_RECORDING)
+    images = [shipped.frames[i].left for i in range(len(shipped))]
+    return replace(shipped, frames=Frames(images.__getitem__, images.__getitem__, shipped.frames.time_s))
+
+
+def named(recording, cause, edit=lambda images: images, time_s=None):
+    images = edit([frame.left for frame in recording.frames])
+    frames = Frames(images.__getitem__, images.__getitem__, recording.frames.time_s if time_s is None else time_s)
+    data = of_recording(recording, recording.truth.u_left, recording.truth.u_right)
+    return with_footage(Diagnosis((cause,)), replace(recording, frames=frames), data).best
+
+
+def interlaced(images):
+    rows = (np.arange(len(images[0])) % 2 == 0)[:, None, None]
+    return [np.where(rows, image, np.roll(image, 4, axis=1)) for image in images]
+
+
+def noisy(images):
+    rng = np.random.default_rng(0)
+    return [cv2.add(image, rng.integers(0, 6, image.shape, dtype=np.uint8)) for image in images]
+
+
+def pulled_down(images):
+    delivered = noisy(images)
+    return [delivered[i * 5 // 6] for i in range(len(images))]
+
+
+@pytest.mark.parametrize(("edit", "name", "cure"), [
+    (noisy, "clock", "Set offset_s."), (interlaced, "interlaced", "even rows"), (pulled_down, "frozen_video", "Drop images"),
+])  # fmt: skip
+def test_a_defect_of_the_images_is_named_in_place_of_the_clock(recording, edit, name, cure):
+    best = named(recording, CLOCK, edit)
+    assert best.name == name and cure in best.cure and best.gain == CLOCK.gain
+
+
+def test_a_defect_of_the_images_is_not_named_where_times_fit(recording):
+    slipped = replace(CLOCK, name="tool_slipped")
+    assert named(recording, slipped, interlaced) is slipped
+
+
+@pytest.mark.parametrize(("fps", "digits", "told"), [(8.0, 1, True), (8.0, 6, False), (10.0, 6, False)])
+def test_rounded_times_are_named(recording, fps, digits, told):
+    best = named(recording, STAMPS, time_s=np.round(np.arange(len(recording)) / fps, digits))
+    assert best.name == "time_stamps" and ("rounded to 0.1 s" in best.text) == told
