@@ -225,7 +225,7 @@ def test_a_site_is_a_copy_that_needs_no_server_of_ours(finished, tmp_path, monke
 @pytest.fixture
 def without_kernels(books, monkeypatch):
     """Notebooks that end as soon as they begin: what is tested is the command around them."""
-    monkeypatch.setattr(command.execution, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
+    monkeypatch.setattr(command.execution, "choose_notebooks", lambda names=(), folder=None: choose_notebooks(names, books))
     monkeypatch.setattr(command, "execute", lambda book, output, values, **options: shutil.copy(book, output) and None)
     numbers = (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))
     before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}  # nohup's child inherits "ignore"
