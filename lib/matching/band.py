@@ -169,7 +169,9 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     best, most, scale = Matches.none("band"), -1, None
     for max_pixels in MAX_PIXELS[where[0]]:
         plan = plan_search(images, masks, rig, where, max_pixels)
-        if plan is None or plan[1] == scale:  # small images have one canvas
+        if plan is None:  # so is that of any other canvas
+            break
+        if plan[1] == scale:  # small images have one canvas
             continue
         scale = plan[1]
         found, textured = _match_on(plan, images, masks, rig, where[0], budget_bytes=budget_bytes, reciprocal=reciprocal)

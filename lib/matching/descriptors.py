@@ -40,11 +40,10 @@ def as_gray(image: ArrayLike, name: str) -> np.ndarray:
 
 
 def of_equal_contrast(images: tuple[np.ndarray, ...], masks: tuple[np.ndarray | None, ...]) -> tuple[np.ndarray, ...]:
-    """Both grey images (h, w) as float32, with the higher of their mean levels, and of their contrasts.
+    """Two grey images (h, w) as float32, brought to the same mean level and contrast: the higher ones of the two.
 
-    The eyes of a microscope may differ in gain and stray light, and descriptors depend on the contrast, since they saturate.
-    It is the upper quartile of the gradient in small copies, where noise and blur count little.  `masks` as in
-    `lib.matching.match`.
+    The eyes of a microscope may differ in gain and stray light.  Descriptors saturate, so they depend on the contrast.  The
+    upper quartile of the gradient in small copies measures it; there noise and blur count little.  `masks` as in `match`.
     """
     levels, contrasts = [], []
     for image, mask in zip(images, masks, strict=True):

@@ -1,4 +1,4 @@
-"""What a recording's files say of a cause that looks like wrong times: interlaced or repeated images, or rounded times."""
+"""Defects of images and frame times that look like wrong times: interlaced images, repeated images, rounded times."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from lib.trust.diagnosis import Diagnosis
 from lib.trust.fitting import Hypothesis
 from lib.trust.health import spread
 
-#: Causes that can be the effect of what this module looks for.
+#: Causes that these defects look like.
 _OF_TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "smoothed_log", "frozen_video")
 _LOOKED_AT, _AROUND = 8, 0.3  # images in which combs are looked for; margin around the tool, as a share of its extent
 _COMBED = 3.0  # least ratio of jagged rows to jagged columns; in images of one instant it is 0.9 to 1.8
@@ -23,7 +23,7 @@ _UNITS_S = (1.0, 0.1, 0.01)  # units to which times may be rounded
 
 
 def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:
-    """The diagnosis of `data`; a defect of images or frame times replaces the cause of wrong times that it looks like."""
+    """The diagnosis of `data`.  If its best cause is about times, a defect of the images or their times takes its place."""
     best = diagnosis.best
     if best is None or best.name not in _OF_TIMES:
         return diagnosis

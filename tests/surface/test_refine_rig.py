@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lib.calibration import calibrate
+from lib.cameras import NearAffineCamera, StereoRig
 from lib.matching import Matches
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.surface import refine_rig
 from notebooks.studies.simulated_rows import simulate_correspondences
 
@@ -30,10 +31,10 @@ def matches_of(rig, x_mm: np.ndarray, rng: np.random.Generator, *, outliers: flo
     return Matches(u_left, u_right, one, covariance, peak_ratio=one, reciprocal=one > 0, method="made")
 
 
-def calibrated(seed: int, **weights):
+def calibrated(seed: int, rig: StereoRig | None = None, **options):
     rng = np.random.default_rng(seed)
-    c = simulate_correspondences(225, rng=rng, sigma_u_px=1.2)
-    return calibrate(c.x_mm, [c.u_left, c.u_right], **weights), c.true_rig, rng
+    c = simulate_correspondences(225, rng=rng, rig=rig, sigma_u_px=1.2)
+    return calibrate(c.x_mm, [c.u_left, c.u_right], **options), c.true_rig, rng
 
 
 def epipolar_rms_px(rig, true_rig) -> float:
@@ -53,6 +54,15 @@ def test_the_matches_epipolar_geometry_is_taken_over(seed):
     assert np.sqrt((moved**2).sum(axis=1).mean()) < 0.5 * np.sqrt(
         np.trace(calibration.point_covariance(x, detection=False), axis1=1, axis2=2).mean()
     )
+
+
+def test_cameras_of_a_finite_distance_are_refined_too():
+    affine, centre_px = reference_rig(), (959.5, 539.5)
+    near = (NearAffineCamera(one.matrix, 1 / 120, centre_px, ROBOT_FROM_MICROSCOPE.t) for one in (affine.left, affine.right))
+    calibration, true_rig, rng = calibrated(8, rig=StereoRig(*near), model="near_affine", image_size_px=(1920, 1080))
+    refined = refine_rig(calibration, matches_of(true_rig, bowl_mm(4000, rng), rng, outliers=0.15))
+    before, after = epipolar_rms_px(calibration.rig, true_rig), epipolar_rms_px(refined, true_rig)
+    assert isinstance(refined.left, NearAffineCamera) and after < 0.25 * before
 
 
 def test_little_is_learnt_from_little():
