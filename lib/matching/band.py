@@ -216,14 +216,13 @@ def _match_on(
     covariance = np.zeros((len(sigma), 4, 4))
     covariance[:, :2, :2] = SIGMA_LEFT_PX**2 * np.eye(2)
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", linear, deviation**2, linear)
-    matches = Matches(
+    return Matches(
         on_image(rectification.left_from_canvas, canvas),
         on_image(rectification.right_from_canvas, canvas + displacement * CELL_PX + (0.0, off_line_px)),
         unique * score,
         covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
         ambiguous=float((~unique[clear]).mean()) if clear.any() else 0.0,
-    )  # fmt: skip
-    return matches, textured
+    ), textured  # fmt: skip
 
 
 def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndarray:
