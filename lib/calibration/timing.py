@@ -6,7 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.interpolate import BSpline
+from scipy.linalg import solveh_banded
 from scipy.stats import chi2
 
 from lib.calibration.affine import camera_columns, estimate_noise, regress
@@ -59,7 +60,10 @@ def _splines(parts: list[tuple[np.ndarray, np.ndarray]], every: int) -> tuple[li
     pieces, sizes = [], [np.zeros(1)]
     for t, x in parts:
         knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
-        pieces.append(make_lsq_spline(t, x, knots, k=3, method="norm-eq"))
+        basis = BSpline.design_matrix(t, knots, 3)  # sparse: `make_lsq_spline` takes a minute for a log of an hour
+        normal = basis.T @ basis
+        bands = np.array([np.pad(normal.diagonal(k), (0, k)) for k in range(4)])
+        pieces.append(BSpline(knots, solveh_banded(bands, basis.T @ x, lower=True), 3))
         freedom = max(len(t) - len(pieces[-1].c), 1) / len(t)
         sizes.append(np.linalg.norm(x - pieces[-1](t), axis=1) / np.sqrt(freedom))
     return pieces, float(np.quantile(np.concatenate(sizes), 0.75) / np.sqrt(chi2.ppf(0.75, 3)))
