@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from lib.adapt import teacher
+from lib.adapt import alignment
 from lib.calibration import estimate
 from lib.landmarks import detector
 from lib.recordings import Recording, frames
@@ -80,7 +80,7 @@ def remembering_teacher() -> Iterator[None]:
 
     Cameras of two models start from one consensus.
     """
-    asked = {teacher: ("calibrate", "calibrate_as_shown", "diagnose", "estimate_time_offset"), Problem: ("fit",)}
+    asked = {alignment: ("calibrate", "calibrate_as_shown", "diagnose", "estimate_time_offset"), Problem: ("fit",)}
     asked[estimate] = ("consensus",)
     with pytest.MonkeyPatch.context() as patch:
         for where, names in asked.items():

@@ -1,49 +1,31 @@
-"""From half-wrong detections to labels: calibrate cameras with the inliers, and project the robot's landmarks through them.
+"""From half-wrong detections to labels: the robot's landmarks, projected through cameras that its detections give.
 
 The robot's report is refused in frames in which its log stands still or the image shows the whole tool elsewhere.  It is
 refused altogether if a fault of clock, axes or tool explains what the images show.
 """
 
-import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from lib.adapt.alignment import LABEL, LEAST_RIGHT, POOR, RefusalError, aligned, clock, placed
 from lib.adapt.looking import Seen, frozen
-from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
-from lib.calibration.offsets import OWN_BIAS, Unsettled, carried, robots_part, shown_axes, tool_axes
-from lib.calibration.timing import clock_error, estimate_time_offset
+from lib.calibration import Calibration, LandmarkOffsets
+from lib.calibration.offsets import OWN_BIAS, carried, robots_part, shown_axes, tool_axes
 from lib.cameras import NearAffineCamera
-from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
-from lib.trust import LEVELS, Hypothesis, diagnose, judge
-from lib.trust.diagnosis import stated
 from lib.trust.fitting import SIDES, Problem
-from lib.trust.verdict import with_scene
 
-#: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
-#: the share from which no other threshold is tried.
-LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
 #: wrong, they agree on another point, such as the elbow of a jaw.
 _LEAST_SURE = 0.5
-#: Faults that disqualify the robot as a teacher, each with the least share of the residuals that it must explain.  A
-#: detector's error that depends on the tool's pose looks like a slow drift of the robot; it explained up to 0.28 of them.
-FAULTS = dict.fromkeys((
-    "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
-    "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
-    "zoom_varies", "time_stamps", "backlash", "odd_pixels", "mixed_units", "same_images",
-), 0.15) | {"robot_drifts": 0.3}  # fmt: skip
-#: Residuals below this share of the tool's length are harmless, whatever fault explains them.
-_HARMLESS = 0.01
 #: Largest share of the frames in which the images may contradict the robot.
 _CONTRADICTED = 0.2
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
@@ -55,13 +37,7 @@ _TURNS_S = 0.02  # between the samples of the log from which axes are taken; sho
 #: Least gain in log likelihood per detection by separate cameras for two parts of the time, if the cameras moved.  A smaller
 #: gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks can do, too.
 _SURE_MOVE = 0.5
-#: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.
-_LARGEST_STEP_S = 0.03
 _BEHIND = 0.1  # least distance from the camera of a visible point, as a share of the working distance
-_CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-#: Fewest labelled pairs that determine outliers and offsets; with fewer, the standard deviation of a robot's usual offsets.
-_FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
-_POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
 #: Largest distance of the measured end of the shaft from the label, in standard deviations; a farther one is another edge.
 _ANOTHER_EDGE = 3.0
 #: Error of the base's label along a tool that the detector knows, as a share of its length: 0.004 RMS on twelve recordings,
@@ -70,14 +46,6 @@ _KNOWN_BASE = 0.01
 #: Prior standard deviations, as shares of the tool's length: of the offset from a detector's point to the labelled one, and
 #: of the shift of an image that errors cause which all landmarks share.
 _OTHER_POINT, _SHARED = 0.3, 0.02
-LABEL = (
-    "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
-    "annotations.json with --labels."
-)
-
-
-class RefusalError(DataError):
-    """The recording cannot teach; the message states why, and what to do."""
 
 
 class OtherBaseError(RefusalError):
@@ -86,7 +54,7 @@ class OtherBaseError(RefusalError):
 
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and a note; all frames and "" if they did not."""
-    rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
+    rows, frames = seen.rows(clock(recording, seen)[0]), seen.frame
     rows = rows.subset(np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1))
     problem = Problem.of(rows, recording.image_size_px)
     used = int(problem.used.sum())
@@ -234,7 +202,7 @@ def teach(
         few = f"in only {len(used.frame)} of {len(seen.frame)} frames the robot moves"
         few = f"labels: {few} and both images are labelled. {LABEL}" if alone else f"kinematics: {few}; check the log."
         raise RefusalError(few)
-    recording, calibration, fault, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
+    recording, calibration, fault, clock_sd_s, right = aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
     if opinion is None and before is None and by_hand is None:
@@ -294,8 +262,8 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
             f"detector: near the robot's report it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
             f"{100 * shares.max():.0f} %. It marks another point for {rare}. {LABEL}"
         )
-    with suppress(*_POOR):
-        return _placed(recording, opinion.of(frames)).offsets
+    with suppress(*POOR):
+        return placed(recording, opinion.of(frames)).offsets
     return None
 
 
@@ -303,153 +271,6 @@ def _length_mm(recording: Recording) -> float:
     """Median length of the tool, from its base to the middle of its tips."""
     x = recording.landmarks_mm()
     return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
-
-
-def _aligned(
-    recording: Recording, seen: Seen, *, by_hand: bool
-) -> tuple[Recording, Calibration, Hypothesis | None, float, float]:
-    """The recording with its clock corrected, the cameras, a fault or None, the clock's sd in s, the share of inliers.
-
-    The fault is a wrong opening of the jaws, which may also be the detector's.  A `RefusalError` if no cameras of a stereo
-    microscope explain the detections (or labels, if `by_hand`), or if another fault explains them.
-    """
-    calibrated = partial(_by_labels if by_hand else _by_detections, seen=seen)
-    recording, clock_sd_s = _clock(recording, seen, by_hand=by_hand)
-    try:
-        calibration = calibrated(recording)
-    except RefusalError as error:  # perhaps the clock is so far off that too few inliers are left to estimate it
-        if error.__cause__ is not None:
-            raise
-        recording = _scanned_clock(recording, lambda one: _fitted(one, seen).view_inliers.sum())
-        clock_sd_s = 0.01
-        calibration = calibrated(recording)
-    for _ in range(2):
-        step_s, sd_s = clock_error(calibration, seen.rows(recording), recording.kinematics, recording.offset_s)
-        surer = sd_s <= 1.1 * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan with few pairs gives no sd
-        if np.isinf(sd_s) or not surer:
-            break
-        clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
-        if not 0.1 * sd_s < abs(step_s) < _LARGEST_STEP_S:
-            break
-        recording = replace(recording, offset_s=recording.offset_s + step_s)
-        calibration = calibrated(recording)
-    for _ in range(3):
-        fault = _fault(recording, seen, calibration, by_hand=by_hand)
-        if fault is None or fault.name != "clock":
-            break
-        recording = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value)
-        clock_sd_s = 1e-3 * fault.sd
-        calibration = calibrated(recording)
-    if fault is not None and fault.name != "jaw_opening":
-        raise RefusalError(f"robot: {fault.text} {fault.cure}")
-    right = float(calibration.view_inliers.sum() / max(_reported(recording, seen), 1))
-    return recording, calibration, fault, clock_sd_s, right
-
-
-def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[Recording, float]:
-    """The recording with the clocks' offset as estimated from the images, if possible, and its standard deviation in s."""
-    rows = seen.rows(recording)
-    if len(seen.frame) < _FEW_PAIRS:  # too few for that: take the offset with the smallest residuals
-        fit = _by_labels if by_hand else _fitted
-        return _scanned_clock(recording, lambda one: -fit(one, seen).reprojection_rms_px), 0.01
-    for reach_s in (0.2, 1.0):
-        try:
-            found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
-        except _POOR:
-            continue
-        if abs(found.offset_s - recording.offset_s) > 3 * found.sd_s and found.sd_s < 0.02:
-            return replace(recording, offset_s=found.offset_s), found.sd_s
-        return recording, min(found.sd_s, 0.01)
-    return recording, 0.005
-
-
-def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) -> Recording:
-    """The recording with the clock offset of highest merit among 21 within +-0.2 s; `clock_error` refines it later.
-
-    Equal merits prefer the smallest change.  Nothing changes if no offset gives cameras.
-    """
-    def merit_at(change_s: float) -> float:
-        with suppress(*_POOR):
-            return merit(replace(recording, offset_s=recording.offset_s + change_s))
-        return -np.inf
-
-    changes_s = sorted(np.linspace(-0.2, 0.2, 21).round(9).tolist(), key=abs)
-    return replace(recording, offset_s=recording.offset_s + max(changes_s, key=merit_at))
-
-
-def _fitted(recording: Recording, seen: Seen, **more: float | bool) -> Calibration:
-    """Calibrate affine cameras with square pixels, which leave the landmarks' offsets the least freedom."""
-    return calibrate(seen.rows(recording), model="square", image_size_px=recording.image_size_px, **more)
-
-
-def _placed(recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None) -> Calibration:
-    """As `_fitted`, with a finite working distance if the detections show one."""
-    how = {"models": ("square", "square+distance"), "image_size_px": recording.image_size_px, "ransac_px": ransac_px}
-    return calibrate_as_shown(seen.rows(recording, least), **how)
-
-
-def _by_labels(recording: Recording, seen: Seen) -> Calibration:
-    """As `_placed`, from labels set by hand.  If they are few, all are inliers, and offsets have a robot's usual prior."""
-    try:
-        if len(seen.frame) >= _FEW_PAIRS:
-            return _placed(recording, seen)
-        with warnings.catch_warnings(action="ignore", category=Unsettled):  # expected if the clock is off
-            try:
-                return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
-            except _POOR:  # shut jaws have no axes
-                return _fitted(recording, seen, ransac_px=np.inf)
-    except _POOR as error:
-        reason = str(error).partition(". ")[0]  # without the cure, which is to adapt
-        raise RefusalError(f"labels: no cameras agree with them ({reason}). {LABEL}") from error
-
-
-def _by_detections(recording: Recording, seen: Seen) -> Calibration:
-    """Calibrate with the detections, or if they do not agree on cameras, with the confident ones."""
-    reported, length = _reported(recording, seen), tool_length_px(seen.u)
-    reason, best, poor, competing = "none was found", None, None, None
-    near_px = NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
-    # An unknown tool's offsets widen the errors of inliers, so that outliers may not stand apart: hence a last, wide gate.
-    rows_kept = {int((seen.confidence >= least).sum()): least for least in _CONFIDENCES[::-1]}  # equal counts are equal rows
-    for least, ransac_px in (*((least, None) for least in sorted(rows_kept.values())), (MIN_CONFIDENCE, near_px)):
-        if ransac_px is not None and competing:
-            break  # it is unknown which of two cameras is right
-        try:
-            found = _placed(recording, seen, least, ransac_px)
-        except _POOR as error:
-            if ransac_px is None and (not competing or isinstance(error, CompetingCamerasError)):
-                reason = str(error).partition(". ")[0].partition("; ")[0]  # without the cure, which is to adapt
-            competing = error if isinstance(error, CompetingCamerasError) else competing
-            continue
-        right = float(found.view_inliers.sum() / max(reported, 1))
-        if found.view_inliers.sum() < max(LEAST_RIGHT * reported, min(_FEWEST_RIGHT, 0.5 * reported)):
-            reason = f"only {100 * right:.0f} % of the landmarks agree on cameras, {found.view_inliers.sum()} in number"
-        elif found.reprojection_rms_px < near_px:
-            best = best if best and right < 1.5 * best[1] else (found, right)
-            if right > _CLEAR:
-                break
-        else:
-            poor = poor or (found, right)
-    if best or poor:
-        return (best or poor)[0]
-    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {LABEL}") from competing
-
-
-def _reported(recording: Recording, seen: Seen) -> int:
-    """The number of landmarks that the robot reports in the frames of `seen`, counted in both images."""
-    return 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-
-
-def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_hand: bool) -> Hypothesis | None:
-    """The robot's fault that explains the detections, or None.  A `RefusalError` if no stereo microscope has such cameras."""
-    red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
-    if red:
-        raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    if by_hand or calibration.reprojection_rms_px < _HARMLESS * np.nanmedian(tool_length_px(seen.u)):
-        return None
-    rows = seen.rows(recording)
-    rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    best = with_scene(diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)), recording, seen.frame).best
-    return best if best is not None and best.explained >= FAULTS.get(best.name, np.inf) else None
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, judging, looking, loop, report, teach, teacher
+from lib.adapt import RefusalError, adapt, alignment, judging, looking, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
@@ -88,8 +88,6 @@ def test_half_wrong_detections_give_right_labels(world, recording):
 
 
 def test_offsets_of_the_robots_landmarks_are_learnt(world, tmp_path):
-    from lib.calibration.offsets import tool_axes
-
     offset = np.array([[0.1, -0.15, 0.05], [-0.12, 0.1, 0.1], [0.15, 0.1, -0.08]])
     off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
     teacher = taught(off, StandIn(world.u, noise_px=0.7, wrong=0.3))
@@ -108,15 +106,29 @@ def test_a_robot_that_reports_another_opening_is_no_teacher(world, tmp_path, fac
         taught(world.record(tmp_path / "half", robot=half), StandIn(world.u, noise_px=0.7, wrong=0.3))
 
 
+def record_off(world, folder, size_mm, rng):
+    """A recording in which the robot's landmarks have constant offsets of one size in the tool's axes."""
+    offset = rng.normal(size=(3, 3))
+    offset *= size_mm / np.linalg.norm(offset, axis=1, keepdims=True)
+    return world.record(folder / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
+
+
 def test_offsets_of_an_unknown_tool_do_not_hide_which_half_is_right(world, tmp_path):
     """They scatter the right ones so widely that no noise level tells them from the wrong ones."""
-    from lib.calibration.offsets import tool_axes
-
-    offset = np.random.default_rng(3).normal(size=(3, 3))
-    offset *= 0.3 / np.linalg.norm(offset, axis=1, keepdims=True)
-    off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
-    teacher = taught(off, Sure(world.u, noise_px=1.0, wrong=0.5))
+    teacher = taught(record_off(world, tmp_path, 0.3, np.random.default_rng(3)), Sure(world.u, noise_px=1.0, wrong=0.5))
     assert 0.3 < teacher.right < 0.6 and np.median(label_errors(world, teacher)[0]) < 1.5
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_offsets_larger_than_the_errors_of_wrong_detections(world, tmp_path, seed):
+    """Nearly half of the tips are marked too short, by less than the robot's offsets: cameras alone agree with wrong ones."""
+    rng = np.random.default_rng(seed)
+    off = record_off(world, tmp_path, 0.25, rng)
+    short = world.u.copy()
+    share = rng.uniform(0.08, 0.3, (world.n, 2, 2, 1)) * (rng.random((world.n, 2, 2, 1)) < 0.45)
+    short[:, :, 1:] += share * (short[:, :, :1] - short[:, :, 1:])
+    teacher = taught(off, StandIn(short, noise_px=1.0, wrong=0.2))
+    assert np.median(label_errors(world, teacher)[0]) < 1.0
 
 
 def test_cameras_of_a_finite_distance_are_no_affine_ones(tmp_path):
@@ -141,7 +153,7 @@ def test_only_poor_data_are_a_refusal(world, recording, monkeypatch, error, surf
     def broken(*data, **options):
         raise error("operands could not be broadcast together")
 
-    monkeypatch.setattr(teacher, "calibrate_as_shown", broken)
+    monkeypatch.setattr(alignment, "calibrate_as_shown", broken)
     with pytest.raises(ValueError, match="operands" if surfaces else "too few landmarks are right") as raised:
         taught(recording, StandIn(world.u, noise_px=0.7))
     assert isinstance(raised.value, RefusalError) != surfaces
@@ -604,7 +616,7 @@ def off_by_a_fifth(world, tmp_path_factory):
     offset = 0.2 * np.array([[0.0, 0.6, 0.8], [0.6, -0.8, 0.0], [-0.8, 0.0, 0.6]])
     axes = lambda x: np.nan_to_num(tool_axes(x))  # noqa: E731
     folder = tmp_path_factory.mktemp("lab") / "off"
-    return world.record(folder, robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
+    return world.record(folder / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
 
 
 def test_five_labelled_pairs_tell_clock_and_offsets(world, off_by_a_fifth):
@@ -925,12 +937,12 @@ def test_of_few_labels_only_the_offsets_may_go_on_for_ever(monkeypatch):
         return lambda *_, **__: warnings.warn("numbers", kind, stacklevel=2)
 
     few = SimpleNamespace(frame=[0])
-    monkeypatch.setattr(teacher, "_fitted", warned(RuntimeWarning))
+    monkeypatch.setattr(alignment, "_fitted", warned(RuntimeWarning))
     with pytest.warns(RuntimeWarning, match="numbers"):
-        teacher._by_labels(None, few)
-    monkeypatch.setattr(teacher, "_fitted", warned(Unsettled))
+        alignment._by_labels(None, few)
+    monkeypatch.setattr(alignment, "_fitted", warned(Unsettled))
     with warnings.catch_warnings(action="error"):
-        teacher._by_labels(None, few)
+        alignment._by_labels(None, few)
 
 
 def test_epipolar_lines_of_the_eye_hold_for_a_tool_that_is_nearer(monkeypatch):
