@@ -26,7 +26,7 @@ from lib.matching import RigMisfitError
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
-from lib.surface import Reconstruction, depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
+from lib.surface import Reconstruction, depth_map, reconstruct, save_map, save_mesh, save_points, surface_mesh
 from lib.surface.reconstruct import AMBIGUOUS
 from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
@@ -106,7 +106,7 @@ def main_calibrate(argv: list[str]) -> int:
 
 
 def main_reconstruct(argv: list[str]) -> int:
-    """`python3 -m lib reconstruct`: the surface in one stereo frame; writes CSV, GLB, PLY, depth, the rectified pair."""
+    """`python3 -m lib reconstruct`: the surface in one stereo frame; writes CSV, TIFF, GLB, PLY, the rectified pair."""
     a, recording, out = _parsed("reconstruct", main_reconstruct, argv)
     rig, offsets, verdict, data = _calibrated(a, recording, out)
     if rig is None:
@@ -138,10 +138,12 @@ def main_reconstruct(argv: list[str]) -> int:
         save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
     except ImportError as error:
         print(f"Without surface.glb and points.ply: {error}")
+    positions_mm = found.surface.on_grid(*map(np.arange, recording.image_size_px))
+    save_map(out / "surface.tiff", np.where(found.mask_left[:, :, None], np.nan, positions_mm))
     (out / "depth.tiff").unlink(missing_ok=True)  # from an earlier run; without parallel rays there is no depth map
     if found.rig.is_affine:
         depth_mm = depth_map(found.surface, found.rig.left, recording.image_size_px)
-        save_depth_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
+        save_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
     _write_rectified(out, found, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
     hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."

@@ -296,6 +296,11 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, m
     assert commands.main_reconstruct([*argv, "--setting", "fast"]) == 0
     assert 0 < json.loads((tmp_path / "out" / "reconstruction.json").read_text())["depth_sd_of_cameras_mm"] < 1
     assert not (tmp_path / "out" / "depth.tiff").exists(), "it would pass for this run's"
+    points = np.genfromtxt(tmp_path / "out" / "points.csv", delimiter=",", names=True)
+    x, y = (np.rint(points[name]).astype(int) for name in ("left_x_px", "left_y_px"))
+    surface_mm = cv2.imread(str(tmp_path / "out" / "surface.tiff"), cv2.IMREAD_UNCHANGED)[y, x, ::-1]  # OpenCV: B, G, R
+    off_mm = surface_mm - np.stack([points[f"{axis}_mm"] for axis in "xyz"], axis=1)
+    assert np.abs(np.nanmedian(off_mm, axis=0)).max() < 0.1 and np.isfinite(off_mm).mean() > 0.8
     with pytest.raises(ValueError, match="unknown model 'near'; take one of .*near_affine"):
         commands.main_calibrate([*argv, "--model", "near"])
 

@@ -126,12 +126,13 @@ def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tupl
     return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)
 
 
-def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
-    """Write a depth map (h, w) as a 32-bit float TIFF in mm (NaN = no depth)."""
-    path = _suffixed(path, ".tiff", ".tif")
-    if np.ndim(depth_mm) != 2:
-        raise ValueError(f"depth_mm: expected (h, w), got shape {np.shape(depth_mm)}.")
-    write_bytes(path, cv2.imencode(".tiff", np.asarray(depth_mm, dtype=np.float32))[1].tobytes())
+def save_map(path: str | Path, values_mm: np.ndarray) -> Path:
+    """Write depths (h, w) or positions x, y, z (h, w, 3) as a 32-bit float TIFF in mm (NaN = no surface)."""
+    path, values_mm = _suffixed(path, ".tiff", ".tif"), np.asarray(values_mm, dtype=np.float32)
+    if values_mm.ndim != 2 and values_mm.shape[2:] != (3,):
+        raise ValueError(f"values_mm: expected (h, w) or (h, w, 3), got shape {values_mm.shape}.")
+    stored = values_mm if values_mm.ndim == 2 else values_mm[:, :, ::-1]  # OpenCV exchanges the first and the last channel
+    write_bytes(path, cv2.imencode(".tiff", stored)[1].tobytes())
     return path
 
 

@@ -17,7 +17,7 @@ from lib.surface import (
     depth_map,
     fit_surface,
     open3d,
-    save_depth_map,
+    save_map,
     save_mesh,
     save_points,
     surface_mesh,
@@ -121,7 +121,7 @@ def test_a_full_disk_is_an_error_and_the_old_file_stays(surface, tmp_path):
         with pytest.raises(OSError, match="eye"):
             save_mesh(mesh, tmp_path / "eye.glb")
         with pytest.raises(OSError):
-            save_depth_map(tmp_path / "depth.tiff", np.zeros((100, 100)))
+            save_map(tmp_path / "depth.tiff", np.zeros((100, 100)))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
@@ -150,7 +150,7 @@ def test_depth_map_is_the_surface_along_the_view(surface, bowl, tmp_path):
     assert depth.shape == (1080, 1920) and np.isnan(depth[0, 0])
     x = surface([[700.0, 400.0]])[0]
     assert depth[400, 700] == pytest.approx(x @ bowl.rig.left.viewing_direction, abs=1e-5)
-    path = save_depth_map(tmp_path / "depth.tiff", depth)
+    path = save_map(tmp_path / "depth.tiff", depth)
     np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), depth)
 
 
@@ -162,8 +162,8 @@ def test_bad_files_are_named_and_leave_nothing(surface, tmp_path):
         save_points(tmp_path / "cloud.ply", np.full((4, 3), np.nan))
     with pytest.raises(ValueError, match="colours"):
         save_points(tmp_path / "cloud.ply", np.zeros((4, 3)), colours=np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="depth_mm"):
-        save_depth_map(tmp_path / "depth.tiff", np.zeros(4))
+    with pytest.raises(ValueError, match="values_mm"):
+        save_map(tmp_path / "depth.tiff", np.zeros(4))
     with pytest.raises(ValueError, match="step_px"):
         surface_mesh(surface, step_px=0)
     with pytest.raises(FileNotFoundError):
