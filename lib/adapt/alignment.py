@@ -26,6 +26,7 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Number of random parts of the detections that start a fit of all, their size, the rounds of each fit, the largest residual
 #: of a detection that agrees, in scales of the Student t density (or `NEAR`), and the share of inliers that may disagree.
 _PARTS, _PART, _ROUNDS, _AGREES, _OTHERS = 8, 0.35, 12, 3.0, 0.1
+_NEARLY_ALL = 0.8  # share of inliers among the detections, above which no other cameras are searched
 #: Least share of inliers (also the least rate of detection of one landmark relative to the others); their least number; and
 #: the share from which no other threshold is tried.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
@@ -189,7 +190,7 @@ def _agreeing(recording: Recording, seen: Seen, found: Calibration) -> Seen:
 
     An unknown robot's offsets can exceed the errors of wrong detections, so that cameras alone do not separate wrong from
     right.  The fit with offsets has several minima.  Fits of parts of the detections start it, and the likeliest one counts.
-    If it agrees with nearly all inliers of `found`, the result is `seen` itself.
+    If it agrees with nearly all inliers of `found`, or if these are nearly all detections, the result is `seen` itself.
     """
 
     def table(values: np.ndarray, frame: np.ndarray, landmark: np.ndarray) -> np.ndarray:
@@ -198,6 +199,8 @@ def _agreeing(recording: Recording, seen: Seen, found: Calibration) -> Seen:
         return found
 
     rows = seen.rows(recording)
+    if found.view_inliers.sum() > _NEARLY_ALL * rows.seen.sum():
+        return seen
     problem = Problem.of(rows, recording.image_size_px)
     at = problem.number[problem.frame], problem.landmark
     confidence = seen.confidence[np.searchsorted(seen.frame, at[0]), :, at[1]]
