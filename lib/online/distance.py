@@ -24,7 +24,7 @@ _SILENT_S = 0.5  # after a longer gap without a report the velocity is unknown
 class Surface:
     """A reconstruction, the number and time of its frame, and the seconds of its stages.
 
-    `epipolar_px` is the median distance of its matches from the rig's epipolar lines; infinite if the matcher refused the rig.
+    `epipolar_px` is the median distance of its matches from the epipolar lines; infinite if the matcher refused the rig.
     """
 
     reconstruction: Reconstruction | None

@@ -72,7 +72,9 @@ class RigTracker:
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
         self._given = False  # True while a rig that the user gave is in use, which no calibration replaces
         self.verdict = Verdict()
-        self._misfit, self._off_lines = 1.0, False  # see `compare`
+        # By how much the scene shows the calibration's sd to be too small; the least since the calibration: a later rise may
+        # be a change that the monitor must notice.
+        self._misfit, self._least_misfit, self._off_lines = 1.0, 1.0, False
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # for the calibration; number in the last try, and fit
         self._online: OnlineCalibration | None = None  # improved by each frame after the last calibration
         self._monitor: DriftMonitor | None = None
@@ -95,7 +97,7 @@ class RigTracker:
         if self._monitor is None:
             self._monitor = DriftMonitor(rig, covariance_px2=self._noise_px**2, sigma_x_mm=0.0)
         self._monitor.reset(rig)
-        self._scale2 = 1.0
+        self._scale2, self._least_misfit = 1.0, self._misfit
         if calibration is not None:
             both = calibration.view_inliers[calibration.inliers].all(axis=1)
             _, _, weight, r = calibration.system
@@ -126,7 +128,7 @@ class RigTracker:
         if x_mm is None or not np.isfinite(epipolar_px):
             self._off_lines |= epipolar_px == np.inf
             return
-        self._misfit, normal = 1.0, self.rig.epipolar_normal
+        normal = self.rig.epipolar_normal
         left, right = self._motions
         if self.calibration is not None and left is right:  # a motion of both cameras moves no match off its line
             stale = x_mm if left is None else left.transform.inverse().apply(x_mm)
@@ -136,6 +138,7 @@ class RigTracker:
         sd = float(np.sqrt(np.median(normal @ covariance @ normal)))
         self._off_lines = epipolar_px > max(_OFF_LINES[0], _OFF_LINES[1] * sd)
         self._misfit = max(1.0, np.sqrt(max(epipolar_px**2 - _MATCHES_PX**2, 0.0)) / sd) if sd > 0 else 1.0
+        self._least_misfit = min(self._misfit, self._least_misfit)
 
     def is_unsettled(self, index: int) -> bool:
         """True if the newest registration is doubted, because the one before it held only for a short time."""
@@ -357,7 +360,8 @@ class RigTracker:
 
     def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
-        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data.x_mm)) <= CONVINCING * len(data))
+        noise = self._noise(data) + self._rig_covariance(data.x_mm)
+        return bool(len(data) and misfit(rig, data, noise) <= CONVINCING * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """The rows with calibrated offsets added; shut or crossed jaws take the tool's axes from the frames before."""
@@ -409,7 +413,8 @@ class RigTracker:
         """(n, 3, 3) mm^2: covariance of points in the robot's frame by the errors of the rig."""
         own = np.zeros((len(x_mm), 3, 3))
         if self.calibration is not None:
-            own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
+            share = self._remains(x_mm) * self._misfit**2
+            own += self.calibration.point_covariance(x_mm, detection=False) * share
         left, right = self._motions
         if left is right:
             return own if left is None else own + left.covariance_at(left.transform.inverse().apply(x_mm))
@@ -423,9 +428,7 @@ class RigTracker:
         return own + gain @ pixels @ gain.mT
 
     def _remains(self, x_mm: np.ndarray) -> np.ndarray:
-        """Factor (1 or n, 1, 1) on the calibration's covariance at x_mm: of the frames since, and of what the scene shows."""
-        since = np.ones((1, 1, 1)) if self._online is None else self._online.remains(x_mm)[:, None, None]
-        return self._misfit**2 * since
+        return np.ones((1, 1, 1)) if self._online is None else self._online.remains(x_mm)[:, None, None]
 
     @property
     def _motions(self) -> tuple:
@@ -443,7 +446,8 @@ class RigTracker:
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             stale = x_mm if motion is None else motion.transform.inverse().apply(x_mm)
             if known is not None:
-                covariance[:, rows, rows] += (known.projection_covariance(stale) * self._remains(stale))[:, rows, rows]
+                own = known.projection_covariance(stale) * self._remains(stale) * self._least_misfit**2
+                covariance[:, rows, rows] += own[:, rows, rows]
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance

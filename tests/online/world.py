@@ -67,7 +67,8 @@ class World:
         points = rig.triangulate(u_left, u_right)
         plane = Plane(u_left, points.x_mm)
         matches = SimpleNamespace(epipolar_px=float(np.median(np.abs(points.epipolar_px))))
-        return SimpleNamespace(surface=plane, points=points, matches=matches, u=u_left, rig=rig, depth_range_mm=lambda margin: (-9.0, 9.0))
+        found = {"surface": plane, "points": points, "matches": matches, "u": u_left, "rig": rig}
+        return SimpleNamespace(**found, depth_range_mm=lambda margin: (-9.0, 9.0))
 
     def true_distance_mm(self) -> np.ndarray:
         """Along the view of the left camera."""
