@@ -22,13 +22,17 @@ _SILENT_S = 0.5  # after a longer gap without a report the velocity is unknown
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A reconstruction, the number and time of its frame, and the seconds of its stages."""
+    """A reconstruction, the number and time of its frame, and the seconds of its stages.
+
+    `epipolar_px` is the median distance of its matches from the epipolar lines; infinite if the matcher refused the rig.
+    """
 
     reconstruction: Reconstruction | None
     index: int
     time_s: float
     seconds: dict[str, float]
     failures: dict[str, str]  # stage -> why there is no reconstruction
+    epipolar_px: float = float("nan")
 
 
 class TipDistance:

@@ -175,7 +175,7 @@ class OnlinePipeline:
         elif measures and bad_report:
             state, cause = "robot", bad_report
         elif not seen:
-            cause = cause or "no landmarks"
+            cause = f"no landmarks; {cause}" if cause else "no landmarks"
         result.state, result.cause = state, cause or doubt
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
@@ -280,6 +280,8 @@ class OnlinePipeline:
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
             result.failures |= surface.failures
+            if not tracker.doubts(surface.index):
+                tracker.compare(surface.epipolar_px, surface.reconstruction and surface.reconstruction.points.x_mm[::20])
             if surface.reconstruction is not None and not tracker.doubts(surface.index):
                 # The smoothness is chosen once, by held-out error, since the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness

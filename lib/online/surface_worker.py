@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
+from lib.matching import RigMisfitError
 from lib.online.distance import Surface
 from lib.online.result import told
 from lib.surface import Reconstruction, reconstruct
@@ -33,16 +34,19 @@ class SurfaceJob:
 def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstruct) -> Surface:
     """The surface of a job, or the reason why there is none."""
     seconds: dict[str, float] = {}
+    epipolar_px = float("nan")
     try:
         found, failures = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), {}
+        epipolar_px = found.matches.epipolar_px
         found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
     except Exception as error:  # any error at all: the next frame may have a surface
         part = next(reversed(seconds), "match")
         found, failures = None, {_STAGE_OF.get(part, part): told(error)}
+        epipolar_px = float("inf") if isinstance(error, RigMisfitError) else epipolar_px
     spent = Counter()
     for part, duration in seconds.items():
         spent[_STAGE_OF.get(part, part)] += duration
-    return Surface(found, job.index, job.time_s, spent, failures)
+    return Surface(found, job.index, job.time_s, spent, failures, epipolar_px)
 
 
 class Beside:

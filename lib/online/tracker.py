@@ -30,6 +30,13 @@ _UNCALIBRATED = Reason(
     "no_covariance", LEVELS[1], "The cameras were given without a calibration; no standard deviation contains their errors.",
     "Give the Calibration that `lib.calibration.calibrate` returns.",
 )  # fmt: skip
+#: Cameras are doubted if matches of the scene lie farther from their epipolar lines than this, px, and than so many standard
+#: deviations of the cameras; the median distance that the matches' own noise causes.
+_OFF_LINES, _MATCHES_PX = (1.0, 3.0), 0.2
+_OFF_LINES_REASON = Reason(
+    "epipolar", LEVELS[1], "The scene's matches lie farther off the epipolar lines than the cameras' covariance explains.",
+    "The detector may err on this tool or light; see `python3 -m lib check RECORDING`.",
+)  # fmt: skip
 _AGAIN = 30  # frames after a registration in which no microscope moves again; a new motion refutes the registration
 
 
@@ -65,6 +72,9 @@ class RigTracker:
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
         self._given = False  # True while a rig that the user gave is in use, which no calibration replaces
         self.verdict = Verdict()
+        # By how much the scene shows the calibration's sd to be too small; the least since the calibration: a later rise may
+        # be a change that the monitor must notice.
+        self._misfit, self._least_misfit, self._off_lines = 1.0, 1.0, False
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # for the calibration; number in the last try, and fit
         self._online: OnlineCalibration | None = None  # improved by each frame after the last calibration
         self._monitor: DriftMonitor | None = None
@@ -87,7 +97,7 @@ class RigTracker:
         if self._monitor is None:
             self._monitor = DriftMonitor(rig, covariance_px2=self._noise_px**2, sigma_x_mm=0.0)
         self._monitor.reset(rig)
-        self._scale2 = 1.0
+        self._scale2, self._least_misfit = 1.0, self._misfit
         if calibration is not None:
             both = calibration.view_inliers[calibration.inliers].all(axis=1)
             _, _, weight, r = calibration.system
@@ -103,9 +113,32 @@ class RigTracker:
 
     @property
     def doubt(self) -> str:
-        """The level of `verdict` and the names of its reasons, or "" if it is trustworthy."""
-        names = ", ".join(dict.fromkeys(reason.name for reason in self.verdict.reasons))
-        return names and f"the calibration is {self.verdict.level}: {names}"
+        """The level of `verdict` and of what the scene shows, and the names of the reasons, or "" if it is trustworthy."""
+        verdict = Verdict.join([self.verdict, Verdict((_OFF_LINES_REASON,) * self._off_lines)])
+        names = ", ".join(dict.fromkeys(reason.name for reason in verdict.reasons))
+        return names and f"the calibration is {verdict.level}: {names}"
+
+    def compare(self, epipolar_px: float, x_mm: np.ndarray | None) -> None:
+        """Compare the rig with matches of the scene at x_mm (n, 3), of median distance `epipolar_px` from the epipolar lines.
+
+        The scene knows nothing of detector and robot.  If it lies farther off than the rig's covariance says, the errors that
+        the calibration was made with are biased or last longer than assumed, and the covariance is too small.  Infinite: the
+        matcher refused the rig; NaN decides nothing.
+        """
+        if x_mm is None or not np.isfinite(epipolar_px):
+            self._off_lines |= epipolar_px == np.inf
+            return
+        normal = self.rig.epipolar_normal
+        left, right = self._motions
+        if self.calibration is not None and left is right:  # a motion of both cameras moves no match off its line
+            stale = x_mm if left is None else left.transform.inverse().apply(x_mm)
+            covariance = self.calibration.projection_covariance(stale) * self._remains(stale)
+        else:
+            covariance = self._rig_covariance(x_mm)
+        sd = float(np.sqrt(np.median(normal @ covariance @ normal)))
+        self._off_lines = epipolar_px > max(_OFF_LINES[0], _OFF_LINES[1] * sd)
+        self._misfit = max(1.0, np.sqrt(max(epipolar_px**2 - _MATCHES_PX**2, 0.0)) / sd) if sd > 0 else 1.0
+        self._least_misfit = min(self._misfit, self._least_misfit)
 
     def is_unsettled(self, index: int) -> bool:
         """True if the newest registration is doubted, because the one before it held only for a short time."""
@@ -195,7 +228,7 @@ class RigTracker:
             self._since.append(frame)
             return self._resolve(result, scene)
         data, monitor = self.corrected(frame.data), self._monitor
-        alarm = monitor.update(data, covariance_px2=self._noise(data), rig_px2=self._rig_covariance(data))
+        alarm = monitor.update(data, covariance_px2=self._noise(data), rig_px2=self._rig_covariance(data.x_mm))
         result.drift = monitor.statistic
         self._recent.append(frame)
         if alarm:
@@ -240,7 +273,7 @@ class RigTracker:
             return []
         frames = [self.corrected(frame.data) for frame in self._since]
         joined = Correspondences.join(frames).complete
-        noise = self._noise(joined) + self._rig_covariance(joined)
+        noise = self._noise(joined) + self._rig_covariance(joined.x_mm)
         moved_px = np.full(2, np.nan) if self._scene is None else self._scene.moved_px(scene)
         try:
             past = [self.corrected(part) for part in self._past]
@@ -327,7 +360,8 @@ class RigTracker:
 
     def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
-        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= CONVINCING * len(data))
+        noise = self._noise(data) + self._rig_covariance(data.x_mm)
+        return bool(len(data) and misfit(rig, data, noise) <= CONVINCING * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """The rows with calibrated offsets added; shut or crossed jaws take the tool's axes from the frames before."""
@@ -379,7 +413,8 @@ class RigTracker:
         """(n, 3, 3) mm^2: covariance of points in the robot's frame by the errors of the rig."""
         own = np.zeros((len(x_mm), 3, 3))
         if self.calibration is not None:
-            own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
+            share = self._remains(x_mm) * self._misfit**2
+            own += self.calibration.point_covariance(x_mm, detection=False) * share
         left, right = self._motions
         if left is right:
             return own if left is None else own + left.covariance_at(left.transform.inverse().apply(x_mm))
@@ -405,13 +440,14 @@ class RigTracker:
         A = (self._before or self.rig).linear
         return self.detection_covariance(data) + self._scale2 * sigma_x**2 * A @ A.T
 
-    def _rig_covariance(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2: covariance of the rig's projections of these landmarks."""
-        covariance, known = np.zeros((len(data), 4, 4)), self.calibration
+    def _rig_covariance(self, x_mm: np.ndarray) -> np.ndarray:
+        """(n, 4, 4) px^2: covariance of the rig's projections of x_mm (n, 3)."""
+        covariance, known = np.zeros((len(x_mm), 4, 4)), self.calibration
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
-            stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
+            stale = x_mm if motion is None else motion.transform.inverse().apply(x_mm)
             if known is not None:
-                covariance[:, rows, rows] += (known.projection_covariance(stale) * self._remains(stale))[:, rows, rows]
+                own = known.projection_covariance(stale) * self._remains(stale) * self._least_misfit**2
+                covariance[:, rows, rows] += own[:, rows, rows]
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance

@@ -16,6 +16,7 @@ from scipy.special import ndtri
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
+from lib.matching import RigMisfitError
 from lib.online import Settings
 from lib.online.checks import FrameChecks
 from lib.online.feeds import row
@@ -519,3 +520,39 @@ def test_cameras_that_creep_along_the_view_as_fast_as_is_allowed_hardly_harm(sig
         scores.append((result.distance_mm - world.true_distance_mm()) / result.distance_sd_mm)
     assert np.isfinite(scores).mean() > 0.9 and (np.array(scores) > -ndtri(SELDOM.miss_rate)).mean() < 0.02
     assert np.nanstd(scores) < 1.3
+
+
+@pytest.mark.parametrize("biased_px", [0.0, 6.0])
+def test_a_scene_off_the_epipolar_lines_widens_the_sd_and_is_a_doubt(biased_px):
+    """The detector errs in one image as the tool moves, and says nothing of it; the scene knows of no detector."""
+    world = World(3, NOISE_PX)
+    place_mm = (world.x_mm.mean(axis=1) - CENTRE_MM) @ ROBOT_FROM_MICROSCOPE.R
+
+    def detect(images):
+        found = world.detect(images)
+        found.u[0, :, 1] += biased_px * np.tanh(place_mm[world.frame, 1])
+        return found
+
+    results = run(make(world, detector=detect, settings=replace(SELDOM, surface_every=10)), world, 30)
+    told, doubted = results[-1], ["epipolar" in r.cause for r in results[21:]]
+    assert all(doubted) if biased_px else not any(doubted)
+    assert all(r.state == "tracking" for r in results[21:])
+    assert (told.distance_sd_mm.max() > 0.15) == bool(biased_px)
+
+
+def test_a_rig_that_the_matcher_refuses_is_no_plain_tracking():
+    def reconstruct(*images, **options):
+        raise RigMisfitError("rig: it does not fit the images.")
+
+    world = World(3, NOISE_PX)
+    results = run(make(world, reconstruct=reconstruct, settings=replace(SELDOM, surface_every=10)), world, 30)
+    assert all(r.cause == "the calibration is doubtful: epipolar" for r in results[11:])
+
+
+def test_a_tool_that_leaves_while_images_and_robot_disagree_is_named():
+    world, pipeline = deepcopy(scenery())
+    world.tool_px = np.array([16.0, -12.0])
+    run(pipeline, world, 10)
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
+    assert run(pipeline, world, 1)[0].cause.startswith("no landmarks; the scene stands still")

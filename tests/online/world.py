@@ -66,7 +66,9 @@ class World:
         seconds |= {"mask": 0.01, "match": 0.02, "triangulate": 0.03, "surface": 0.04}
         points = rig.triangulate(u_left, u_right)
         plane = Plane(u_left, points.x_mm)
-        return SimpleNamespace(surface=plane, points=points, u=u_left, rig=rig, depth_range_mm=lambda margin: (-9.0, 9.0))
+        matches = SimpleNamespace(epipolar_px=float(np.median(np.abs(points.epipolar_px))))
+        found = {"surface": plane, "points": points, "matches": matches, "u": u_left, "rig": rig}
+        return SimpleNamespace(**found, depth_range_mm=lambda margin: (-9.0, 9.0))
 
     def true_distance_mm(self) -> np.ndarray:
         """Along the view of the left camera."""
