@@ -348,7 +348,7 @@ class Case:
             return
         if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
             self.paths = Paths((kinematics.time_s, own) for own in np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre)
-        if self.paths is None or not all(self.paths.pieces):
+        if self.paths is None or np.isfinite(self.moved(0.0)).all(axis=1).sum() < 6:
             each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
             each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
             steps = np.concatenate([np.diff(time[rows]) for rows in each])

@@ -443,6 +443,15 @@ def test_rounded_times_are_found_although_the_hand_trembles():
     assert best.name == "time_stamps" and best.value == pytest.approx(1e3 * late_s.std(), rel=0.3)
 
 
+def test_a_log_whose_times_come_in_bursts_has_no_path_on_which_instants_could_be_tried():
+    usual = take(fps=1.7)
+    log, number = usual.kinematics, np.arange(len(usual.kinematics.time_s))
+    buffered = Kinematics(log.time_s[number // 20 * 20] + 6e-5 * (number % 20), log.x_mm)
+    x_mm = buffered.at(usual.data.time_s)[np.arange(len(usual.data)), usual.data.landmark]
+    best = found(replace(usual, kinematics=buffered, data=replace(usual.data, x_mm=x_mm))).best
+    assert best.name == "robot_noise"
+
+
 @pytest.mark.parametrize("offset_s", [-2.1, 3.0])
 def test_a_clock_that_is_off_by_seconds_is_found_where_log_and_video_still_overlap(offset_s):
     clock = found(take(offset_s=offset_s, frames=60)).best
