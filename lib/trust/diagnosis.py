@@ -44,6 +44,7 @@ _NEARLY = 0.05  # share of the residuals: causes that explain this much less sti
 _MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
 _UNITS = (1e3, 1e-3, 1e2, 1e-2, 1e1, 1e-1)  # ratios of units of length that are tried
 _ALIKE, _RIGID = 5.0, 0.1  # landmarks of a tool move as far within this factor, and stay apart within this share of it
+_OPEN = 0.1  # distance of the tips as a share of the tool's length, from which jaws are open
 _STILL_PX, _STILL_MM = 0.3, 0.04  # detections in copies of one picture vary by less, and so does a robot at rest
 
 
@@ -385,6 +386,18 @@ def _mixed_units(data: Correspondences) -> list[Hypothesis]:
     return []
 
 
+def _same_tips(data: Correspondences) -> list[Hypothesis]:
+    """Tips that the robot always reports at one point, while the images show open jaws."""
+    x, u = data.grid("x_mm"), data.grid("u_left")
+    if x.shape[1] < len(LANDMARKS) or not (x[:, 1] == x[:, 2]).any() or (np.abs(x[:, 1] - x[:, 2]) > 0).any():
+        return []
+    open_px, length_px = (np.linalg.norm(u[:, 2] - u[:, k], axis=1) for k in (1, 0))
+    if not np.nanmedian(np.append(open_px / length_px, np.nan)) > _OPEN:
+        return []
+    text, cure = "The robot reports both tips at one point.", "Calculate each tip from the opening of the jaws in its log."
+    return [Hypothesis("same_tips", text, cure, 100.0, 0.0, "%", 1.0, float(len(data)))]
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """The hypotheses, most likely first."""
@@ -440,7 +453,7 @@ def diagnose(
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
-    if mixed := _mixed_units(data):
+    if mixed := _mixed_units(data) or _same_tips(data):
         return Diagnosis(tuple(mixed))
     if (problem.y[:, 0] == problem.y[:, 1])[problem.used.all(axis=1)].all(axis=1).mean() > 0.5:
         text, cure = "Left and right images are the same.", "Put the right camera's own images into RECORDING."

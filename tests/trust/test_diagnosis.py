@@ -627,3 +627,13 @@ def test_an_offset_of_the_base_of_a_pivoting_tool_is_named_with_its_size(offset_
     best = diagnose(pivoting(offset_mm)).best
     assert best.name == "landmark_offset" and best.text.split(": ")[1].startswith("base by")
     assert best.value == pytest.approx(600, abs=100)
+
+
+@pytest.mark.parametrize(("opening_mm", "named"), [((0.5, 1.4), "same_tips"), ((0.02, 0.05), None)])
+def test_tips_that_the_robot_reports_at_one_point_are_named_where_the_images_show_open_jaws(opening_mm, named):
+    usual = take(opening_mm=opening_mm)
+    x, log = usual.data.x_mm.reshape(-1, 3, 3).copy(), usual.kinematics.x_mm.copy()
+    x[:, 1:], log[:, 1:] = x[:, 1:].mean(axis=1, keepdims=True), log[:, 1:].mean(axis=1, keepdims=True)
+    log = Kinematics(usual.kinematics.time_s, log)
+    best = found(replace(usual, data=replace(usual.data, x_mm=x.reshape(-1, 3)), kinematics=log)).best
+    assert (best and best.name) == named
