@@ -41,6 +41,9 @@ _JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgic
 #: Longest usual time for which a log may repeat a position; the fewest different positions, and their least usual distance in
 #: units of the robot's accuracy, from which it is known.
 _HELD_S, _FEWEST_NEW, _STEPS = 0.015, 10, 3.0
+#: Rows that a buffer delivers together: bursts take less than the first share of the time, and pauses between them are at
+#: most this long, in s; longer ones may be breaks in the work.
+_BURST_SHARE, _LONGEST_PAUSE_S = 0.1, 1.0
 _SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
@@ -194,6 +197,9 @@ class Recording:
         steps = len(new) > _FEWEST_NEW and np.median(jump_mm[new]) > _STEPS * self.robot_accuracy_mm  # else it is a fine grid
         held_s = float(np.median(np.diff(log_s[new]))) if steps else 0.0
         repeats = held_s > max(_HELD_S, 1.5 * usual_s)
+        pauses_s = step[step > 5.0 * usual_s]
+        bursts = len(pauses_s) > _FEWEST_NEW and pauses_s.sum() > (1.0 - _BURST_SHARE) * logged
+        pause_s, burst = (float(np.median(pauses_s)), len(log_s) / (len(pauses_s) + 1)) if bursts else (np.inf, 0.0)
         videos = [] if own_times else self.folder.glob("*.mp4")
         stated = [video_times(path) for path in videos if path.stem in SIDES]
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
@@ -204,6 +210,9 @@ class Recording:
             (repeats, "repeated_samples",
              f"kinematics.csv has a row every {usual_s:.3g} s, but usually a new position only every {held_s:.3g} s.",
              "Keep the first of each run of equal rows: the robot was there then, and not later."),
+            (pause_s <= _LONGEST_PAUSE_S, "bursts",
+             f"The log's times come in bursts: usually {burst:.0f} rows, then none for {pause_s:.2g} s.",
+             "A buffer held the rows back: log the robot's own times, or spread each burst evenly to the next, check again."),
             (late_s > 0.5 / self.fps, "video_times", f"The videos' times are {late_s:.3g} s off those of fps = {self.fps:g}.",
              "Set fps to the videos' rate, or if it varies, write the times of their frames to frames.csv (frame, time_s)."),
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",

@@ -18,7 +18,7 @@ from lib.landmarks.shaft import outlined
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame, encoded
 from lib.trust.health import spread
-from lib.trust.verdict import LEVELS, TEMPLATES, Assessment, assess, report
+from lib.trust.verdict import LEVELS, LOG_DOUBTS, TEMPLATES, Assessment, assess, report
 
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # number of best frames on the page, and of worst frames
@@ -129,7 +129,7 @@ def _next(recording: Recording, a: Assessment, frames: range) -> str:
     """The next step, in words.  Wrong time stamps come first where there is no calibration or no specific cause."""
     best = a.diagnosis.best
     unspecific = a.calibration is None or (best is not None and best.name in ("detector_unfit", "robot_noise"))
-    unspecific |= any(doubt.name == "repeated_samples" for doubt in recording.doubts)
+    unspecific |= any(doubt.name in LOG_DOUBTS for doubt in recording.doubts)
     if unspecific and a.verdict.is_red and recording.mistimed:
         return recording.mistimed
     if a.verdict.level != LEVELS[0]:

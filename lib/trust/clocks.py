@@ -7,6 +7,8 @@ from itertools import product
 import numpy as np
 
 from lib.calibration.timing import shift_misfits
+from lib.correspondences import Correspondences
+from lib.recordings import Kinematics
 from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust
 
 #: Clock rates that are tried: seconds of the robot's clock per second of the video's stated time; -1 is time backwards.
@@ -18,6 +20,7 @@ _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in ha
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
 _ASTRAY = 10.0  # largest residual of frames of other instants, over the scale; at no instant do wrong detections fit so well
+_OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
 #: The cure if one camera's images belong to other instants.
 PAIR_AGAIN = "Look for images that one camera lost, and pair left and right images of one instant."
 
@@ -232,6 +235,21 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
             text = f"Residuals of a moving tool grow row by row: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Set readout_s = {max(readout_s, 0.0):.4f} in recording.toml."
             yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
+
+
+def log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s: float) -> list[Hypothesis]:
+    """A clock that is so far off that the robot's log does not cover many of the frames."""
+    time = np.unique(data.time_s[data.seen.any(axis=1)]) + offset_s
+    if kinematics is None or not len(time) or not np.isfinite(time).all():
+        return []
+    first, last = kinematics.time_s[[0, -1]]
+    outside = float(((time < first) | (time > last)).mean())
+    if outside < _OUTSIDE:
+        return []
+    text = f"{100 * outside:.0f} % of the frames ({time[0]:.1f} to {time[-1]:.1f} s on the robot's clock) lie outside "
+    text += f"its log ({first:.1f} to {last:.1f} s)."
+    cure = "Check offset_s in recording.toml, and the times in frames.csv and kinematics.csv."
+    return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
 
 
 #: Tests that need the tool's path over time (`Case.paths`).

@@ -18,7 +18,7 @@ from lib.calibration.timing import shift_misfits
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.parallel import single_threaded_blas
 from lib.recordings import Kinematics, Recording
-from lib.trust.clocks import TIME_TESTS
+from lib.trust.clocks import TIME_TESTS, log_elsewhere
 from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
@@ -28,6 +28,7 @@ _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # most rows that are used; three frames le
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and least distance of a spike from its output
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, and `calibrate` corrects such offsets
+_SHARED_SDS = 8.0  # largest error, in its sd, of a shared offset along the shaft: from about 1 px that depends on the pose
 _LEAST_LENGTH_MM = 1.0  # larger than the error of any tool calibration
 _LENGTHS_MM = np.linspace(-5.0, 85.0, 37)  # lengths of the tool that are tried, if the robot's report lacks it
 #: Gain in log likelihood of moved cameras (16 numbers), or of a jump (6), over a slipped tool (3) that rules the latter out.
@@ -41,9 +42,9 @@ _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
 _MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
-_OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
 _UNITS = (1e3, 1e-3, 1e2, 1e-2, 1e1, 1e-1)  # ratios of units of length that are tried
 _ALIKE, _RIGID = 5.0, 0.1  # landmarks of a tool move as far within this factor, and stay apart within this share of it
+_OPEN = 0.1  # distance of the tips as a share of the tool's length, from which jaws are open
 _STILL_PX, _STILL_MM = 0.3, 0.04  # detections in copies of one picture vary by less, and so does a robot at rest
 
 
@@ -76,13 +77,21 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
-    """Landmarks with large offsets from the robot's report, constant in the tool's axes."""
+    """Landmarks with large offsets from the robot's report, constant in the tool's axes.
+
+    If the tool turns about a pivot, an offset along the shaft that all landmarks share is nearly a change of the cameras.
+    """
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
-    sizes = 1e3 * np.linalg.norm(free.offsets, axis=1)
-    size, sd = sizes.max(), 1e3 * free.offset_sd[sizes.argmax()]
+    along = np.tile([1.0, 0.0, 0.0], 3)
+    apart, shared_sd = np.eye(9) - np.outer(along, along) / 3, np.sqrt(along @ free.offset_covariance @ along) / 3
+    shared, most = np.median(free.offsets[:, 0]), _SHARED_SDS * shared_sd
+    offsets = free.offsets - np.clip(shared, -most, most) * along.reshape(3, 3)
+    variance = np.diag(apart @ free.offset_covariance @ apart).reshape(3, 3).sum(axis=1) + (abs(shared) > most) * shared_sd**2
+    sizes, sds = 1e3 * np.linalg.norm(offsets, axis=1), 1e3 * np.sqrt(variance)
+    size, sd = sizes.max(), sds[sizes.argmax()]
     if size - 2.0 * sd > _LEAST_OFFSET_UM:
-        far = [k for k in np.argsort(-sizes) if sizes[k] > 2e3 * free.offset_sd[k]]
-        each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in free.offsets[k])})" for k in far]
+        far = [k for k in np.argsort(-sizes) if sizes[k] > 2.0 * sds[k]]
+        each = [f"{LANDMARKS[k]} by {sizes[k]:.0f} um ({', '.join(f'{1e3 * v:.0f}' for v in offsets[k])})" for k in far]
         text = f"Landmarks have constant offsets from the robot's report, in the tool's axes: {'; '.join(each)}."
         cure = "Robot or detector errs; labels set by hand show which. `calibrate` removes such offsets (--force if refused)."
         found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
@@ -361,21 +370,6 @@ def _prefer_simple(found: list[Hypothesis]) -> list[Hypothesis]:
     return found
 
 
-def _log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s: float) -> list[Hypothesis]:
-    """A clock that is so far off that the robot's log does not cover many of the frames."""
-    time = np.unique(data.time_s[data.seen.any(axis=1)]) + offset_s
-    if kinematics is None or not len(time) or not np.isfinite(time).all():
-        return []
-    first, last = kinematics.time_s[[0, -1]]
-    outside = float(((time < first) | (time > last)).mean())
-    if outside < _OUTSIDE:
-        return []
-    text = f"{100 * outside:.0f} % of the frames ({time[0]:.1f} to {time[-1]:.1f} s on the robot's clock) lie outside "
-    text += f"its log ({first:.1f} to {last:.1f} s)."
-    cure = "Check offset_s in recording.toml, and the times in frames.csv and kinematics.csv."
-    return [Hypothesis("clock", text, cure, 0.0, np.inf, "ms", outside, 2.0 * len(data))]
-
-
 def _mixed_units(data: Correspondences) -> list[Hypothesis]:
     """A landmark in another unit of length than the others: it keeps its distance from them only times a power of ten."""
     x = data.grid("x_mm")[:, : len(LANDMARKS)]
@@ -390,6 +384,18 @@ def _mixed_units(data: Correspondences) -> list[Hypothesis]:
             cure = f"Multiply the columns of {name} in kinematics.csv by {factor:g}, or state their unit in the mapping."
             return [Hypothesis("mixed_units", text, cure, factor, 0.0, "times", 1.0, float(len(data)))]
     return []
+
+
+def _same_tips(data: Correspondences) -> list[Hypothesis]:
+    """Tips that the robot always reports at one point, while the images show open jaws."""
+    x, u = data.grid("x_mm"), data.grid("u_left")
+    if x.shape[1] < len(LANDMARKS) or not (x[:, 1] == x[:, 2]).any() or (np.abs(x[:, 1] - x[:, 2]) > 0).any():
+        return []
+    open_px, length_px = (np.linalg.norm(u[:, 2] - u[:, k], axis=1) for k in (1, 0))
+    if not np.nanmedian(np.append(open_px / length_px, np.nan)) > _OPEN:
+        return []
+    text, cure = "The robot reports both tips at one point.", "Calculate each tip from the opening of the jaws in its log."
+    return [Hypothesis("same_tips", text, cure, 100.0, 0.0, "%", 1.0, float(len(data)))]
 
 
 @dataclass(frozen=True)
@@ -442,12 +448,12 @@ def diagnose(
     few = problem.used.all(axis=1).sum() < 6
     if len(frames) < _FEWEST_FRAMES or (few and len(data) < 12):
         return Diagnosis()
-    apart = _log_elsewhere(data, kinematics, offset_s)
+    apart = log_elsewhere(data, kinematics, offset_s)
     if few:
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
-    if mixed := _mixed_units(data):
+    if mixed := _mixed_units(data) or _same_tips(data):
         return Diagnosis(tuple(mixed))
     if (problem.y[:, 0] == problem.y[:, 1])[problem.used.all(axis=1)].all(axis=1).mean() > 0.5:
         text, cure = "Left and right images are the same.", "Put the right camera's own images into RECORDING."

@@ -82,7 +82,7 @@ class Robust:
     covariance: np.ndarray  # (k, k) of theta
     moved_px: np.ndarray  # (n, 2, 2) shift of the pixels by the additional terms
     offsets: np.ndarray  # (3, 3) mm of the landmarks in the tool's axes
-    offset_sd: np.ndarray  # (3,) mm, their standard deviations, all axes together
+    offset_covariance: np.ndarray  # (9, 9) mm^2 of these
     nearness: tuple[float, float]  # 1/distance, per mm, and its standard deviation
     camera_covariance: np.ndarray  # (16, 16) of M
     residuals: np.ndarray  # (n, 2, 2) px
@@ -285,9 +285,9 @@ class Problem:
         shapes, design = [shape for shape, _ in found], self._design_effect(r * root)
         excess = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # ratio of `information` to the Fisher information
         inverse = np.linalg.inv(information) * design * excess
-        offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
-        found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape), beta[16:25].reshape(3, 3), offset_sd
+        found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape)
+        found += beta[16:25].reshape(3, 3), inverse[16:25, 16:25]
         return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, apart, tuple(shapes), total, design)
 
     def _design_effect(self, z: np.ndarray) -> float:
@@ -348,7 +348,7 @@ class Case:
             return
         if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
             self.paths = Paths((kinematics.time_s, own) for own in np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre)
-        if self.paths is None or not all(self.paths.pieces):
+        if self.paths is None or np.isfinite(self.moved(0.0)).all(axis=1).sum() < 6:
             each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
             each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
             steps = np.concatenate([np.diff(time[rows]) for rows in each])

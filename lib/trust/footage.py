@@ -1,4 +1,4 @@
-"""Defects of images and frame times that look like wrong times: interlaced images, repeated images, rounded times."""
+"""Defects of images and tables that look like wrong times or robot noise: interlaced or repeated images, rounded numbers."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ _STRETCHES, _STRETCH = 3, 13  # stretches of consecutive images that are compare
 #: An image repeats if it differs from the one before by less than the first share of the usual change, although the robot
 #: moved by more than the second share of its usual step.  Fewer repeats than the last share do little harm.
 _SAME, _MOVES, _LEAST_REPEATED = 0.1, 0.5, 0.05
-_UNITS_S = (1.0, 0.1, 0.01)  # units to which times may be rounded
+_UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.1)  # units to which times and positions may be rounded
 
 
 def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:
@@ -28,6 +28,7 @@ def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondenc
     if best is None or best.name not in _OF_TIMES:
         return diagnosis
     found = _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
+    found = found or _rounded_log(best, recording)
     return Diagnosis((found, *(h for h in diagnosis.hypotheses if h.name != best.name))) if found else diagnosis
 
 
@@ -79,3 +80,13 @@ def _rounded(best: Hypothesis, recording: Recording) -> Hypothesis | None:
         return None
     text = f"The frames' times are rounded to {unit_s:g} s, and err by up to {500 * unit_s:g} ms."
     return replace(best, text=text, cure="Write the frames' times to frames.csv as they were measured, to the millisecond.")
+
+
+def _rounded_log(best: Hypothesis, recording: Recording) -> Hypothesis | None:
+    """Positions that are multiples of a coarse unit, and errors of the size of its rounding."""
+    x = recording.kinematics.x_mm[np.isfinite(recording.kinematics.x_mm)]
+    unit_mm = next((unit_mm for unit_mm in _UNITS_MM if np.abs(x - unit_mm * np.rint(x / unit_mm)).max() < 1e-6), 0.0)
+    if best.name != "robot_noise" or not 0.2 * unit_mm < 1e-3 * best.value < unit_mm:
+        return None
+    text = f"The robot's positions are rounded to {unit_mm:g} mm, and err by up to {500 * unit_mm:g} um along each axis."
+    return replace(best, text=text, cure="Log the robot's positions with all digits, to the micrometre.")

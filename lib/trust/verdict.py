@@ -73,7 +73,8 @@ _LABEL_PX = 3.0
 #: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
-_BY_REPEATS = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what a log that repeats samples causes
+_BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what such doubts about the log cause:
+LOG_DOUBTS = ("repeated_samples", "bursts")
 #: Causes of which a refused calibration says less, or something else.
 _KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
@@ -156,8 +157,8 @@ def judge(
         text = best.text
         if best.evidence is not None and best.name != "landmark_offset":
             text += f" It explains {100 * best.explained:.0f} % of the residuals."
-        repeats = [doubt.cure for doubt in doubts if doubt.name == "repeated_samples" and best.name in _BY_REPEATS]
-        found += _reason("diagnosis", best.explained, text, *(repeats or [best.cure]), best.name)
+        by_log = [doubt.cure for doubt in doubts if doubt.name in LOG_DOUBTS and best.name in _BY_LOG]
+        found += _reason("diagnosis", best.explained, text, (by_log or [best.cure])[0], best.name)
     if calibration is None:
         kinds = {NoDetectionError: "no_detection", CompetingCamerasError: "refused", NoConsensusError: "no_consensus"}
         name = next((name for kind, name in kinds.items() if isinstance(error, kind)), "refused")

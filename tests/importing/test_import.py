@@ -629,6 +629,15 @@ def test_a_clock_beyond_its_search_is_refused_with_the_search_and_the_cure(late_
         import_recording(folder, mapping, tmp_path / "eye")
 
 
+def test_a_log_in_bursts_that_leaves_no_clock_to_estimate_is_said_to_come_in_bursts(shipped, tmp_path):
+    number = np.arange(len(shipped.robot_s))
+    buffered = replace(shipped, robot_s=shipped.robot_s[number // 20 * 20] + 6e-5 * (number % 20))
+    folder, mapping = source_of(tmp_path, buffered, foreign.images, foreign.robot_csv, foreign.labels_coco)
+    mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
+    with pytest.raises(ValueError, match=r"The log's times come in bursts: usually 20 rows, then none for 0\.2 s\."):
+        import_recording(folder, mapping, tmp_path / "eye")
+
+
 @pytest.mark.parametrize(("late_s", "narrow_s", "refused"), [
     (60.0, 20, r"^robot\.offset_s, searched from .* Or give a number"),
     (17.0, 5, r"^robot\.offset_s, searched from -5\.000 to 5\.000 s: .* Or give a number"),

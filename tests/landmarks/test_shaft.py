@@ -70,6 +70,7 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     found = shaft_end(pictured(u, sine, taper=taper), FRAMES, labels[:, :, 0], shown(u, sine))
     length = np.linalg.norm(axis, axis=-1)
     assert (np.linalg.norm(found.u - u[:, :, 0], axis=-1) / length).max() < 0.012
+    assert 0.01 < found.sd < 0.02 if taper == 0 else 0.03 < found.sd < 0.04  # where a neck ends is less sure
     assert found.pictures.shape == (2, 141, 161, 3) and found.outline.shape[::2] == (2, 2)
     middle = found.outline.mean(axis=1)[:, 1]
     assert np.abs(middle - 70).max() < 4  # the outline lies around the tool's axis, which is the row of the label

@@ -729,6 +729,19 @@ def test_a_log_that_repeats_its_positions_is_in_doubt(held, grid_mm, named):
         assert "Keep the first of each run of equal rows" in recording.mistimed
 
 
+@pytest.mark.parametrize(("burst_s", "pause_s", "named"), [(0.001, 0.2, True), (0.1, 0.2, False), (0.001, 5.0, False)])
+def test_a_log_whose_times_come_in_bursts_is_in_doubt(burst_s, pause_s, named, tmp_path):
+    """Rows that a buffer delivers together; a log with breaks, or that states a part of the motion, is as it should be."""
+    starts = np.arange(-2.0 * pause_s, 12 * pause_s + 4, pause_s)
+    times = (starts[:, None] + np.linspace(0, burst_s, 20)).ravel()
+    log, at = Kinematics(times, np.zeros((len(times), 3, 3))), Frames(None, None, np.arange(int(250 * pause_s)) / 25)
+    (tmp_path / "frames.csv").touch()
+    shipped = Recording.open(paths.SHIPPED_RECORDING)
+    recording = replace(shipped, folder=tmp_path, frames=at, fps=25.0, offset_s=0.0, kinematics=log)
+    assert [d.name for d in recording.doubts if d.name != "little_overlap"] == ["bursts"] * named
+    assert not named or "bursts: usually 20 rows, then none for 0.2 s. A buffer" in recording.mistimed
+
+
 @pytest.mark.parametrize("times", [np.arange(30) / 50, np.cumsum(np.where(np.arange(30) % 10 == 9, 0.4, 0.04))])
 def test_a_video_whose_times_are_not_those_of_fps_is_in_doubt(times, tmp_path):
     """Without frames.csv the times in the videos are not read, so that another or a variable rate would be missed."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lib import paths
 from lib.calibration import calibrate
@@ -14,6 +15,7 @@ from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.recordings import Kinematics, Recording
 from lib.simulator import Microscope
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import Hypothesis, diagnose
 from lib.trust.diagnosis import stated
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene, takes
@@ -441,6 +443,15 @@ def test_rounded_times_are_found_although_the_hand_trembles():
     assert best.name == "time_stamps" and best.value == pytest.approx(1e3 * late_s.std(), rel=0.3)
 
 
+def test_a_log_whose_times_come_in_bursts_has_no_path_on_which_instants_could_be_tried():
+    usual = take(fps=1.7)
+    log, number = usual.kinematics, np.arange(len(usual.kinematics.time_s))
+    buffered = Kinematics(log.time_s[number // 20 * 20] + 6e-5 * (number % 20), log.x_mm)
+    x_mm = buffered.at(usual.data.time_s)[np.arange(len(usual.data)), usual.data.landmark]
+    best = found(replace(usual, kinematics=buffered, data=replace(usual.data, x_mm=x_mm))).best
+    assert best.name == "robot_noise"
+
+
 @pytest.mark.parametrize("offset_s", [-2.1, 3.0])
 def test_a_clock_that_is_off_by_seconds_is_found_where_log_and_video_still_overlap(offset_s):
     clock = found(take(offset_s=offset_s, frames=60)).best
@@ -582,3 +593,47 @@ def test_a_base_that_the_detector_hardly_knows_is_no_bent_tool():
     covariance = bent.data.covariance_px2 * np.where(base, 60.0**2, 1.0)
     vague = found(replace(bent, data=replace(bent.data, covariance_px2=covariance)))
     assert "tool_bends" in names and "tool_bends" not in [h.name for h in vague.hypotheses]
+
+
+def pivoting(offset_mm=(0.0, 0.0, 0.0), frames=300):
+    """Detections of a tool that turns about a pivot, marked up to 0.7 px along the shaft; the robot's base has an offset."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(-1, 1, (frames, 3))
+    middle = place * [5.0, 3.0, 1.5]
+    along = middle - [-70.0, 0.0, -40.0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    side = Rotation.from_rotvec(rng.uniform(-1, 1, (frames, 1)) * along).apply(np.cross([0.0, 0.0, 1.0], along))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    half = rng.uniform(0.2, 0.7, (frames, 1)) * side
+    x = np.stack([middle - 1.5 * along, middle + 1.5 * along - half, middle + 1.5 * along + half], axis=1)
+    u = [side.reshape(x.shape[:2] + (2,)) for side in reference_rig().project(ROBOT_FROM_MICROSCOPE.apply(x.reshape(-1, 3)))]
+    error_px = (place[:, 0] ** 2 + place[:, 1] ** 2 - 2 / 3)[:, None]
+    marked = []
+    for pixels in u:
+        shown = pixels[:, 1:].mean(axis=1) - pixels[:, 0]
+        error = error_px * shown / np.linalg.norm(shown, axis=1, keepdims=True)
+        marked.append((pixels - error[:, None] + rng.normal(0, 0.7, pixels.shape)).reshape(-1, 2))
+    x[:, 0] += np.stack([along, side, np.cross(along, side)], axis=2) @ offset_mm
+    rows = {"frame": np.repeat(np.arange(frames), 3), "landmark": np.tile(np.arange(3), frames)}
+    return Correspondences.of_points(ROBOT_FROM_MICROSCOPE.apply(x.reshape(-1, 3)), *marked, **rows)
+
+
+def test_an_error_that_depends_on_the_pose_of_a_pivoting_tool_is_no_offset_of_all_landmarks():
+    assert diagnose(pivoting()).best is None
+
+
+@pytest.mark.parametrize("offset_mm", [(0.6, 0.0, 0.0), (-0.6, 0.0, 0.0)])
+def test_an_offset_of_the_base_of_a_pivoting_tool_is_named_with_its_size(offset_mm):
+    best = diagnose(pivoting(offset_mm)).best
+    assert best.name == "landmark_offset" and best.text.split(": ")[1].startswith("base by")
+    assert best.value == pytest.approx(600, abs=100)
+
+
+@pytest.mark.parametrize(("opening_mm", "named"), [((0.5, 1.4), "same_tips"), ((0.02, 0.05), None)])
+def test_tips_that_the_robot_reports_at_one_point_are_named_where_the_images_show_open_jaws(opening_mm, named):
+    usual = take(opening_mm=opening_mm)
+    x, log = usual.data.x_mm.reshape(-1, 3, 3).copy(), usual.kinematics.x_mm.copy()
+    x[:, 1:], log[:, 1:] = x[:, 1:].mean(axis=1, keepdims=True), log[:, 1:].mean(axis=1, keepdims=True)
+    log = Kinematics(usual.kinematics.time_s, log)
+    best = found(replace(usual, data=replace(usual.data, x_mm=x.reshape(-1, 3)), kinematics=log)).best
+    assert (best and best.name) == named

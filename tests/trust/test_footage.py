@@ -65,3 +65,11 @@ def test_a_defect_of_the_images_is_not_named_where_times_fit(recording):
 def test_rounded_times_are_named(recording, fps, digits, told):
     best = named(recording, STAMPS, time_s=np.round(np.arange(len(recording)) / fps, digits))
     assert best.name == "time_stamps" and ("rounded to 0.1 s" in best.text) == told
+
+
+@pytest.mark.parametrize(("digits", "told"), [(1, True), (3, False)])
+def test_rounded_positions_are_named(recording, digits, told):
+    noise = replace(CLOCK, name="robot_noise", value=50.0, unit="um")
+    log = replace(recording.kinematics, x_mm=np.round(recording.kinematics.x_mm, digits))
+    best = named(replace(recording, kinematics=log), noise)
+    assert best.name == "robot_noise" and ("rounded to 0.1 mm" in best.text) == told
