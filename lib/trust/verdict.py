@@ -73,8 +73,8 @@ _LABEL_PX = 3.0
 #: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
-_BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")  # what such doubts about the log cause:
-LOG_DOUBTS = ("repeated_samples", "bursts")
+LOG_DOUBTS = ("repeated_samples", "bursts")  # doubts about the times of the log, and the named faults that they explain
+_BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")
 #: Causes of which a refused calibration says less, or something else.
 _KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
 OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's

@@ -616,7 +616,7 @@ def off_by_a_fifth(world, tmp_path_factory):
     offset = 0.2 * np.array([[0.0, 0.6, 0.8], [0.6, -0.8, 0.0], [-0.8, 0.0, 0.6]])
     axes = lambda x: np.nan_to_num(tool_axes(x))  # noqa: E731
     folder = tmp_path_factory.mktemp("lab") / "off"
-    return world.record(folder / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
+    return world.record(folder, robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
 
 
 def test_five_labelled_pairs_tell_clock_and_offsets(world, off_by_a_fifth):
