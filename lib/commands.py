@@ -26,7 +26,7 @@ from lib.matching import RigMisfitError
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
-from lib.surface import Reconstruction, depth_map, reconstruct, save_map, save_mesh, save_points, surface_mesh
+from lib.surface import Reconstruction, reconstruct, save_map, save_mesh, save_points, surface_mesh
 from lib.surface.reconstruct import AMBIGUOUS
 from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
@@ -139,11 +139,11 @@ def main_reconstruct(argv: list[str]) -> int:
     except ImportError as error:
         print(f"Without surface.glb and points.ply: {error}")
     positions_mm = found.surface.on_grid(*map(np.arange, recording.image_size_px))
-    save_map(out / "surface.tiff", np.where(found.mask_left[:, :, None], np.nan, positions_mm))
+    positions_mm[found.mask_left] = np.nan
+    save_map(out / "surface.tiff", positions_mm)
     (out / "depth.tiff").unlink(missing_ok=True)  # from an earlier run; without parallel rays there is no depth map
     if found.rig.is_affine:
-        depth_mm = depth_map(found.surface, found.rig.left, recording.image_size_px)
-        save_map(out / "depth.tiff", np.where(found.mask_left, np.nan, depth_mm))
+        save_map(out / "depth.tiff", positions_mm @ found.rig.left.viewing_direction)
     _write_rectified(out, found, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # refined by the matches
     hidden = f"Tool, glints and a dark surround hide {100 * found.mask_left.mean():.0f} % of the left image."

@@ -60,7 +60,8 @@ def aligned(
     """The recording with its clock corrected, the cameras, a fault or None, the clock's sd in s, the share of inliers.
 
     The fault is a wrong opening of the jaws, which may also be the detector's.  A `RefusalError` if no cameras of a stereo
-    microscope explain the detections (or labels, if `by_hand`), or if another fault explains them.
+    microscope explain the detections (or labels, if `by_hand`), or if another fault explains them.  Detections are judged
+    twice if cameras and offsets together agree with others than cameras alone do (`_agreeing`).
     """
     calibrated = partial(_by_labels if by_hand else _by_detections, seen=seen)
     recording, clock_sd_s = clock(recording, seen, by_hand=by_hand)
@@ -186,37 +187,31 @@ def _by_detections(recording: Recording, seen: Seen) -> Calibration:
 
 
 def _agreeing(recording: Recording, seen: Seen, found: Calibration) -> Seen:
-    """A copy without confidence in detections that disagree with cameras and offsets which are fitted to all at once.
+    """A copy in which detections lose their confidence if a fit of cameras and offsets to all of them disagrees.
 
-    An unknown robot's offsets can exceed the errors of wrong detections, so that cameras alone do not separate wrong from
-    right.  The fit with offsets has several minima.  Fits of parts of the detections start it, and the likeliest one counts.
-    If it agrees with nearly all inliers of `found`, or if these are nearly all detections, the result is `seen` itself.
+    The robot's offsets can exceed the errors of wrong detections.  Then cameras alone do not separate wrong from right.  The
+    fit with offsets has several minima: fits to parts of the detections start it, and the likeliest result counts.  `seen`
+    itself is returned if this agrees with nearly all inliers of `found`, or if nearly all detections are such inliers.
     """
-
-    def table(values: np.ndarray, frame: np.ndarray, landmark: np.ndarray) -> np.ndarray:
-        found = np.zeros(seen.confidence.shape, dtype=bool)
-        found[np.searchsorted(seen.frame, frame), :, landmark] = values
-        return found
-
     rows = seen.rows(recording)
     if found.view_inliers.sum() > _NEARLY_ALL * rows.seen.sum():
         return seen
+    usable = np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1)
+    rows, inliers = rows.subset(usable), found.view_inliers[usable]
     problem = Problem.of(rows, recording.image_size_px)
-    at = problem.number[problem.frame], problem.landmark
-    confidence = seen.confidence[np.searchsorted(seen.frame, at[0]), :, at[1]]
-    parts = [*(confidence >= np.reshape(_CONFIDENCES, (-1, 1, 1)))]
-    parts += [*(np.random.default_rng(0).random((_PARTS, *confidence.shape)) < _PART)]
-    parts = [replace(problem, seen=problem.seen & part) for part in parts]
+    random = np.random.default_rng(0).random((_PARTS, *inliers.shape)) < _PART
+    parts = (replace(problem, seen=problem.seen & part) for part in (*(rows.confidence >= c for c in _CONFIDENCES), *random))
     starts = [part.fit(rounds=_ROUNDS).start for part in parts if part.used.sum() >= _FEWEST_RIGHT]
     if not starts:
         return seen
     fit = max((problem.fit(start=start, rounds=_ROUNDS) for start in starts), key=lambda fit: fit.total)
     near_px = np.maximum(_AGREES * problem.noise * fit.shapes[0].scale, NEAR * np.nanmedian(tool_length_px(seen.u)))
-    near = np.linalg.norm(fit.residuals, axis=2) < near_px
-    right, inliers = table(near, *at), table(found.view_inliers, rows.frame, rows.landmark)
-    if (inliers & ~right).sum() <= _OTHERS * inliers.sum():
+    agrees = np.linalg.norm(fit.residuals, axis=2) < near_px
+    if (inliers & ~agrees).sum() <= _OTHERS * inliers.sum():
         return seen
-    return seen._replace(confidence=np.where(right, seen.confidence, 0.0))
+    confidence = seen.confidence.copy()
+    confidence[np.searchsorted(seen.frame, rows.frame), :, rows.landmark] *= agrees
+    return seen._replace(confidence=confidence)
 
 
 def _reported(recording: Recording, seen: Seen) -> int:

@@ -280,11 +280,13 @@ class OnlinePipeline:
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
             result.failures |= surface.failures
-            if not tracker.doubts(surface.index):
-                tracker.compare(surface.epipolar_px, surface.reconstruction and surface.reconstruction.points.x_mm[::20])
-            if surface.reconstruction is not None and not tracker.doubts(surface.index):
+            if tracker.doubts(surface.index):
+                continue
+            found = surface.reconstruction
+            tracker.compare(surface.epipolar_px, None if found is None else found.points.x_mm[::20])
+            if found is not None:
                 # The smoothness is chosen once, by held-out error, since the eye is the same in the next frame.
-                self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
-                self._most_points = max(self._most_points, len(surface.reconstruction.u))
+                self._surface, self._smoothness = surface, found.surface.fit.smoothness
+                self._most_points = max(self._most_points, len(found.u))
         if self._surface is not None:
             result.reconstruction, result.reconstructed_at = self._surface.reconstruction, self._surface.index

@@ -79,14 +79,15 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks with large offsets from the robot's report, constant in the tool's axes.
 
-    If the tool turns about a pivot, an offset along the shaft that all landmarks share is nearly a change of the cameras.
+    A tool that turns about a pivot hardly determines an offset along the shaft that all landmarks share, since a change of
+    the cameras looks nearly the same.  So of that part only what exceeds `_SHARED_SDS` standard deviations counts.
     """
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
-    along = np.tile([1.0, 0.0, 0.0], 3)
-    apart, shared_sd = np.eye(9) - np.outer(along, along) / 3, np.sqrt(along @ free.offset_covariance @ along) / 3
-    shared, most = np.median(free.offsets[:, 0]), _SHARED_SDS * shared_sd
-    offsets = free.offsets - np.clip(shared, -most, most) * along.reshape(3, 3)
-    variance = np.diag(apart @ free.offset_covariance @ apart).reshape(3, 3).sum(axis=1) + (abs(shared) > most) * shared_sd**2
+    covariance, along = free.offset_covariance, np.tile([1.0, 0.0, 0.0], 3)
+    shared, shared_sd = np.median(free.offsets[:, 0]), np.sqrt(along @ covariance @ along) / 3
+    counts = shared - np.clip(shared, -_SHARED_SDS * shared_sd, _SHARED_SDS * shared_sd)
+    offsets, rest = free.offsets + (counts - shared) * along.reshape(3, 3), np.eye(9) - np.outer(along, along) / 3
+    variance = np.diag(rest @ covariance @ rest).reshape(3, 3).sum(axis=1) + (counts != 0) * shared_sd**2
     sizes, sds = 1e3 * np.linalg.norm(offsets, axis=1), 1e3 * np.sqrt(variance)
     size, sd = sizes.max(), sds[sizes.argmax()]
     if size - 2.0 * sd > _LEAST_OFFSET_UM:

@@ -285,10 +285,11 @@ class Problem:
         shapes, design = [shape for shape, _ in found], self._design_effect(r * root)
         excess = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # ratio of `information` to the Fisher information
         inverse = np.linalg.inv(information) * design * excess
+        terms = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape)
+        offsets = beta[16:25].reshape(3, 3), inverse[16:25, 16:25]
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
-        found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape)
-        found += beta[16:25].reshape(3, 3), inverse[16:25, 16:25]
-        return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, apart, tuple(shapes), total, design)
+        known = *terms, *offsets, nearness, inverse[:16, :16]
+        return Robust(beta[:26], M, *known, r, apart, tuple(shapes), total, design)
 
     def _design_effect(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over blocks of frames, relative to independent residuals."""
