@@ -20,7 +20,7 @@ from lib.recordings import Doubt, Recording, Scene
 from lib.trust.clocks import PAIR_AGAIN
 from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
 from lib.trust.fitting import SIDES
-from lib.trust.footage import with_footage
+from lib.trust.footage import blurred, with_footage
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -364,7 +364,8 @@ def assess(
         shaft = _shaft(recording, data, calibration)  # faults of the robot would blur the aligned images
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
-        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts, epipolar_at_mm=at_mm, shaft=shaft,
+        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=[*recording.doubts, *blurred(recording, np.unique(data.frame))],
+        epipolar_at_mm=at_mm, shaft=shaft,
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if len(recording) < FEWEST_TO_TRAIN:  # `adapt` would refuse them

@@ -12,7 +12,7 @@ from lib import paths
 from lib.correspondences import of_recording
 from lib.recordings import Frames, Recording
 from lib.trust import Diagnosis, Hypothesis
-from lib.trust.footage import with_footage
+from lib.trust.footage import blurred, with_footage
 
 CLOCK = Hypothesis("clock", "10 ms", "Set offset_s.", 10.0, 1.0, "ms", explained=0.8, gain=90.0)
 STAMPS = replace(CLOCK, name="time_stamps", value=30.0)
@@ -73,3 +73,40 @@ def test_rounded_positions_are_named(recording, digits, told):
     log = replace(recording.kinematics, x_mm=np.round(recording.kinematics.x_mm, digits))
     best = named(replace(recording, kinematics=log), noise)
     assert best.name == "robot_noise" and ("rounded to 0.1 mm" in best.text) == told
+
+
+def blurry(image):
+    return cv2.GaussianBlur(image, (0, 0), 4)
+
+
+def scaled_up(image):
+    return cv2.resize(cv2.resize(image, None, fx=0.2, fy=0.2, interpolation=cv2.INTER_AREA), image.shape[1::-1])
+
+
+def with_eyes(recording, **edits):
+    """The recording that ships with its `left` or `right` images edited."""
+    frames = Recording.open(paths.SHIPPED_RECORDING).frames
+
+    def eye(side):
+        return lambda i: edits[side](i, getattr(frames[i], side)) if side in edits else getattr(frames[i], side)
+
+    return replace(recording, frames=Frames(eye("left"), eye("right"), frames.time_s))
+
+
+@pytest.mark.parametrize(("side", "edit", "first"), [
+    ("right", blurry, 6), ("left", blurry, 0), ("right", scaled_up, 6), ("left", np.zeros_like, 6),
+])  # fmt: skip
+def test_an_eye_that_is_blurred_is_told(recording, side, edit, first):
+    spoilt = with_eyes(recording, **{side: lambda i, image: edit(image) if i >= first else image})
+    (doubt,) = blurred(spoilt, np.arange(len(spoilt)))
+    assert doubt.name == "blurred" and f"the {side} image" in doubt.text and side in doubt.cure
+    assert first <= int(doubt.text.partition("first in frame ")[2].partition(",")[0]) <= first + 2
+
+
+@pytest.mark.parametrize("edit", [
+    lambda i, image: image, lambda i, image: image // 2, lambda i, image: np.repeat(image[..., 1:2], 3, axis=2),
+    lambda i, image: cv2.add(image, np.random.default_rng(i).integers(0, 10, image.shape, dtype=np.uint8)),
+])  # fmt: skip
+def test_eyes_that_differ_in_brightness_colour_or_noise_are_not_blurred(recording, edit):
+    spoilt = with_eyes(recording, right=edit)
+    assert not blurred(spoilt, np.arange(len(spoilt)))
