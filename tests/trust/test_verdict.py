@@ -234,6 +234,7 @@ def stub(monkeypatch):
     """A near scene, a recording of it without pictures, and what the recording states."""
     monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
     monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
+    monkeypatch.setattr(verdicts, "blurred", lambda *_: [])
     scene = spoiling.Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
     stated = {key: getattr(scene, key) for key in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     recording = MagicMock(folder=Path("stub"), doubts=(), robot_accuracy_mm=0.01, **stated)
