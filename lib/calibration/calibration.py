@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.checks import extents
-from lib.calibration.models import Fit
 from lib.calibration.robust import gate
 from lib.cameras import Camera, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform, points, precision, view_distances2
-from lib.least_squares import inverse
+from lib.least_squares import Minimum, inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class Calibration:
     """Cameras and their uncertainty, the result of `lib.calibration.calibrate`.
 
     Attributes:
-        minimum: The fit to the inliers.
+        minimum: The fit to the inliers (`lib.calibration.models.fit`).
         parameter_covariance: (p, p) covariance of the model's parameters.
         view_inliers: (n, cameras) bool: the views used, one row for each row of the data.
         sigma_u_px, sigma_x_mm: Noise levels, given or estimated; with `covariance_px2`, sigma_u_px is its `noise_rms_px`.
@@ -58,7 +57,7 @@ class Calibration:
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
-    minimum: Fit
+    minimum: Minimum
     parameter_covariance: np.ndarray
     view_inliers: np.ndarray
     sigma_u_px: float
@@ -99,7 +98,7 @@ class Calibration:
     @property
     def cost(self) -> float:
         """The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square)."""
-        return self.minimum.cost
+        return self.minimum.energy
 
     @property
     def covariance(self) -> np.ndarray:
@@ -160,12 +159,12 @@ class Calibration:
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives by points and by parameters, inverse covariances, residuals of the inliers; 0 in views not used."""
-        _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
+        _, J_x, J_c = self.minimum.state.evaluate(self.minimum.work.points)
         J = J_x[:1] if self.minimum.state.model.is_affine else J_x
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
         noise = noise if len(noise) == 1 else noise[self.inliers]
         weight = precision(noise + self.sigma_x_mm**2 * J @ J.mT, self.view_inliers[self.inliers])
-        return J_x, J_c, weight, self.minimum.residuals
+        return J_x, J_c, weight, self.minimum.work.residuals
 
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
         """(n, m, m) px^2: covariance of the projections of exact points, from the calibration's uncertainty alone."""
