@@ -10,7 +10,7 @@ from lib.calibration.checks import extents
 from lib.calibration.robust import gate
 from lib.cameras import Camera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, points, precision, view_distances2
+from lib.geometry import points, precision, view_distances2
 from lib.least_squares import Minimum, inverse
 
 
@@ -220,43 +220,34 @@ class Optics:
             Only perspective can distinguish two mirrored cameras from two unmirrored ones on the other side of the scene.
         convergence_rad: Angle between the viewing directions (of the unmirrored pair).
         roll_rad: Rotation of the right image's content relative to the left's, x towards y.
-        robot_from_microscope: Pose of the stereo head: x right in the mean image, z along the mean viewing direction,
-            origin where the rays of the two image centres come closest to each other.
+        centre_mm: (3,) where the rays of the two image centres come closest to each other.
     """
 
     mirrored: str
     convergence_rad: float
     roll_rad: float
-    robot_from_microscope: RigidTransform
+    centre_mm: np.ndarray
 
 
 def optics(calibration: Calibration) -> Optics:
     """Derives the pair's geometry; a ValueError refuses a single camera, in which a mirror cannot be noticed."""
     rig = calibration.pair
-    directions = np.stack([rig.left.viewing_direction, rig.right.viewing_direction])
-    cosine = float(directions[0] @ directions[1])
+    cosine = float(rig.left.viewing_direction @ rig.right.viewing_direction)
     # Signs of 1/distance where it is at least three standard deviations; negative = mirrored.
     distance, sd = calibration.inverse_distance_per_mm
     signs = np.sign([getattr(c, "inverse_distance_per_mm", 0.0) * (abs(distance) >= 3 * sd) for c in calibration.cameras])
     if cosine < 0:
         mirrored = ("left" if signs[0] < 0 else "right") if signs.any() and signs.sum() == 0 else "left or right"
-        directions[1] *= -1
     else:
         mirrored = ("both" if signs.sum() < 0 else "no") if signs.any() else "unknown"
-    z = directions.sum(axis=0) * (-1.0 if mirrored in ("both", "left") else 1.0)
-    z /= np.linalg.norm(z)
     rows = [camera.linear / np.linalg.norm(camera.linear, axis=1, keepdims=True) for camera in (rig.left, rig.right)]
-    x = rows[0][0] if mirrored != "left" else rows[1][0]
-    x = x - (x @ z) * z
-    x /= np.linalg.norm(x)
     roll = float(np.arctan2(-rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
     else:
         centre = np.nanmean(calibration.y_px[calibration.inliers].reshape(-1, 2, 2), axis=(0, 1))
-    origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
-    return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, np.cross(z, x), z]), origin))
+    return Optics(mirrored, angle, roll, rig.triangulate(centre[None], centre[None]).x_mm[0])
 
 
 class OnlineCalibration:
