@@ -19,22 +19,17 @@ class LandmarkOffsets:
     """Constant offsets of the landmarks that the detector sees from those that the robot reports.
 
     Attributes:
-        offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images; (k, d, d).
+        offset, standard_deviation: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images.
         prior_sd: Standard deviation of an offset's coordinate in the prior, given or chosen by maximum evidence.
         p_value: Probability of offsets at least as large as the data show, if there are none (score test).
         turns: True if the axes are those of the landmarks as detected, False if those of the landmarks as reported.
     """
 
     offset: np.ndarray
-    covariance: np.ndarray
+    standard_deviation: np.ndarray
     prior_sd: float
     p_value: float
     turns: bool = False
-
-    @property
-    def standard_deviation(self) -> np.ndarray:
-        """(k, d) standard deviations of the offsets' coordinates."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
