@@ -216,8 +216,7 @@ def _results_of_rig(
         what = "the recording has {} x {} px".format(*image_size_px)
         what = f"its cameras are for images of {width} x {height} px, {what}"
         raise ValueError(f"{paths.shown(rig)}: {what}; calibrate with images of this size.")
-    unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
-    return folder, verdict, None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
+    return folder, verdict, None if offset is None else LandmarkOffsets(offset, np.nan * offset, np.nan, np.nan, turns)
 
 
 def _common_motion(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:

@@ -100,7 +100,7 @@ def test_register_knows_the_offsets_that_the_calibration_removed(tmp_path, monke
     truth = Recording.open(paths.SHIPPED_RECORDING)
     offset_mm = np.array([[0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, -0.1, 0.2]])
     rows = of_recording(truth, truth.truth.u_left, truth.truth.u_right)
-    beside = with_offsets(rows, LandmarkOffsets(-offset_mm, np.zeros((3, 3, 3)), 0.1, 0.0))
+    beside = with_offsets(rows, LandmarkOffsets(-offset_mm, np.zeros((3, 3)), 0.1, 0.0))
     monkeypatch.setattr(commands, "_labelled", lambda recording: beside)
     folder = [str(paths.SHIPPED_RECORDING), *LABELS, "--out", str(tmp_path)]
     assert commands.main_calibrate([*folder, "--force"]) == 0

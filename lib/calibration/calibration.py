@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.checks import extents
-from lib.calibration.models import Fit
 from lib.calibration.robust import gate
 from lib.cameras import Camera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, points, precision, view_distances2
-from lib.least_squares import inverse
+from lib.geometry import points, precision, view_distances2
+from lib.least_squares import Minimum, inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,22 +19,17 @@ class LandmarkOffsets:
     """Constant offsets of the landmarks that the detector sees from those that the robot reports.
 
     Attributes:
-        offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images; (k, d, d).
+        offset, standard_deviation: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images.
         prior_sd: Standard deviation of an offset's coordinate in the prior, given or chosen by maximum evidence.
         p_value: Probability of offsets at least as large as the data show, if there are none (score test).
         turns: True if the axes are those of the landmarks as detected, False if those of the landmarks as reported.
     """
 
     offset: np.ndarray
-    covariance: np.ndarray
+    standard_deviation: np.ndarray
     prior_sd: float
     p_value: float
     turns: bool = False
-
-    @property
-    def standard_deviation(self) -> np.ndarray:
-        """(k, d) standard deviations of the offsets' coordinates."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +37,7 @@ class Calibration:
     """Cameras and their uncertainty, the result of `lib.calibration.calibrate`.
 
     Attributes:
-        minimum: The fit to the inliers.
+        minimum: The fit to the inliers (`lib.calibration.models.fit`).
         parameter_covariance: (p, p) covariance of the model's parameters.
         view_inliers: (n, cameras) bool: the views used, one row for each row of the data.
         sigma_u_px, sigma_x_mm: Noise levels, given or estimated; with `covariance_px2`, sigma_u_px is its `noise_rms_px`.
@@ -58,7 +52,7 @@ class Calibration:
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
-    minimum: Fit
+    minimum: Minimum
     parameter_covariance: np.ndarray
     view_inliers: np.ndarray
     sigma_u_px: float
@@ -99,7 +93,7 @@ class Calibration:
     @property
     def cost(self) -> float:
         """The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square)."""
-        return self.minimum.cost
+        return self.minimum.energy
 
     @property
     def covariance(self) -> np.ndarray:
@@ -160,12 +154,12 @@ class Calibration:
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives by points and by parameters, inverse covariances, residuals of the inliers; 0 in views not used."""
-        _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
+        _, J_x, J_c = self.minimum.state.evaluate(self.minimum.work.points)
         J = J_x[:1] if self.minimum.state.model.is_affine else J_x
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
         noise = noise if len(noise) == 1 else noise[self.inliers]
         weight = precision(noise + self.sigma_x_mm**2 * J @ J.mT, self.view_inliers[self.inliers])
-        return J_x, J_c, weight, self.minimum.residuals
+        return J_x, J_c, weight, self.minimum.work.residuals
 
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
         """(n, m, m) px^2: covariance of the projections of exact points, from the calibration's uncertainty alone."""
@@ -221,43 +215,34 @@ class Optics:
             Only perspective can distinguish two mirrored cameras from two unmirrored ones on the other side of the scene.
         convergence_rad: Angle between the viewing directions (of the unmirrored pair).
         roll_rad: Rotation of the right image's content relative to the left's, x towards y.
-        robot_from_microscope: Pose of the stereo head: x right in the mean image, z along the mean viewing direction,
-            origin where the rays of the two image centres come closest to each other.
+        centre_mm: (3,) where the rays of the two image centres come closest to each other.
     """
 
     mirrored: str
     convergence_rad: float
     roll_rad: float
-    robot_from_microscope: RigidTransform
+    centre_mm: np.ndarray
 
 
 def optics(calibration: Calibration) -> Optics:
     """Derives the pair's geometry; a ValueError refuses a single camera, in which a mirror cannot be noticed."""
     rig = calibration.pair
-    directions = np.stack([rig.left.viewing_direction, rig.right.viewing_direction])
-    cosine = float(directions[0] @ directions[1])
+    cosine = float(rig.left.viewing_direction @ rig.right.viewing_direction)
     # Signs of 1/distance where it is at least three standard deviations; negative = mirrored.
     distance, sd = calibration.inverse_distance_per_mm
     signs = np.sign([getattr(c, "inverse_distance_per_mm", 0.0) * (abs(distance) >= 3 * sd) for c in calibration.cameras])
     if cosine < 0:
         mirrored = ("left" if signs[0] < 0 else "right") if signs.any() and signs.sum() == 0 else "left or right"
-        directions[1] *= -1
     else:
         mirrored = ("both" if signs.sum() < 0 else "no") if signs.any() else "unknown"
-    z = directions.sum(axis=0) * (-1.0 if mirrored in ("both", "left") else 1.0)
-    z /= np.linalg.norm(z)
     rows = [camera.linear / np.linalg.norm(camera.linear, axis=1, keepdims=True) for camera in (rig.left, rig.right)]
-    x = rows[0][0] if mirrored != "left" else rows[1][0]
-    x = x - (x @ z) * z
-    x /= np.linalg.norm(x)
     roll = float(np.arctan2(-rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
     else:
         centre = np.nanmean(calibration.y_px[calibration.inliers].reshape(-1, 2, 2), axis=(0, 1))
-    origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
-    return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, np.cross(z, x), z]), origin))
+    return Optics(mirrored, angle, roll, rig.triangulate(centre[None], centre[None]).x_mm[0])
 
 
 class OnlineCalibration:

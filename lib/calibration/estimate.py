@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 from lib.calibration import checks as refuse
 from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
-from lib.calibration.models import Fit, Model, State, fit
+from lib.calibration.models import Model, State, fit
 from lib.calibration.offsets import Unsettled, estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import pair_covariance, precision, view_distances2
-from lib.least_squares import inverse
+from lib.least_squares import Minimum, inverse
 from lib.parallel import single_threaded_blas
 
 #: Fewest rows with the tool's axes from which `offsets=None` estimates offsets.
@@ -151,7 +151,7 @@ def calibrate_as_shown(
     'near_affine'
     """
     found = calibrate(data, model=models[0], **options)
-    state, x = found.minimum.state, found.minimum.points
+    state, x = found.minimum.state, found.minimum.work.points
     far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
     with suppress(DataError, np.linalg.LinAlgError):  # too few rows for one more parameter
         value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
@@ -275,7 +275,7 @@ def _calibrate(
     parameter_covariance = inverse(minimum.information)
     if weighting == "paper":  # its weights are not the inverse noise covariances: the sandwich H^-1 G H^-1
         variance_u, variance_x = paper_variances(sigma_u, sigma_x)
-        _, J_x, J_c = minimum.state.evaluate(minimum.points)
+        _, J_x, J_c = minimum.state.evaluate(minimum.work.points)
         outer = J_x @ J_x.mT
         WJ = precision(variance_u * np.eye(m) + variance_x * outer, views[inliers]) @ J_c
         G = np.einsum("nip,nij,njq->pq", WJ, scale**2 * claimed + sigma_x**2 * outer, WJ)
@@ -301,7 +301,7 @@ def _calibrate(
 def _minimise(
     plan: Model, x: np.ndarray, y: np.ndarray, views: np.ndarray, noise: np.ndarray | None, weighting: str,
     known: dict[str, float | None], image_size_px: tuple[int, int] | None,
-) -> tuple[Fit, tuple[float, float]]:  # fmt: skip
+) -> tuple[Minimum, tuple[float, float]]:  # fmt: skip
     """The minimum for the inlier views (n, cameras) bool, and the noise levels (sigma_u, sigma_x)."""
     m, whole = y.shape[1], bool(views.all())
     used = np.repeat(views, 2, axis=1)
@@ -327,5 +327,5 @@ def _minimise(
             start = affine_minimum(x, y, variance_u, variance_x).matrix
         state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
-        residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
+        residuals, A, parameters = minimum.work.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels

@@ -6,14 +6,14 @@ cameras, so all models share the same derivatives.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
 from lib.geometry import cross, precision
-from lib.least_squares import minimise
+from lib.least_squares import Minimum, minimise
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
@@ -196,26 +196,21 @@ class State:
         return result.reshape(-1, result.shape[2])
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A minimum: the state, the energy `cost`, the corrected `points` x~ (n, 3), residuals and information.
+class Corrected(NamedTuple):
+    """What `settle` finds: the corrected points x~ (n, 3), residuals, and the inverse covariances S^-1 of the residuals.
 
-    The `residuals` (n, m) px are linearised, y - f(x~) - J (x - x~), so that their covariance is Sigma + v_x J J^T.
-    `information` (p, p) is the Gauss-Newton Hessian in the model's parameters.
+    The `residuals` (n, m) px, 0 in unused views, are linearised, y - f(x~) - J (x - x~), so that S = noise + v_x J J^T.
     """
 
-    state: State
-    cost: float
     residuals: np.ndarray
     points: np.ndarray
-    information: np.ndarray
-    converged: bool
+    weight: np.ndarray
 
 
 def settle(
     state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """The corrected points x~ that minimise a state's energy: cost, linearised residuals (0 in unused views), x~, S^-1."""
+) -> tuple[float, Corrected]:
+    """The energy of a state, and the corrected points x~ that minimise it."""
     points, linear = x, state.model.is_affine
     for _ in range(1 if linear or variance_x == 0 else 4):
         f, J, _ = state.evaluate(points, derivatives=False)
@@ -224,30 +219,29 @@ def settle(
         weight = precision(noise + variance_x * J @ J.mT, views)
         white = (weight @ r[:, :, None])[:, :, 0]
         points = x + variance_x * (white[:, None] @ J)[:, 0]
-    return 0.5 * float((r * white).sum()), np.where(np.repeat(views, 2, axis=1), r, 0.0), points, weight
+    return 0.5 * float((r * white).sum()), Corrected(np.where(np.repeat(views, 2, axis=1), r, 0.0), points, weight)
 
 
-def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Fit:
+def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Minimum:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
     Eliminating every point exactly gives residuals of covariance S = noise + variance_x J J^T and a system in the camera
     parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; `views` (n, cameras) bool are used.
+    The minimum's `work` is `Corrected`.
     """
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
-    def evaluate(state: State) -> tuple[float, tuple] | None:
+    def evaluate(state: State) -> tuple[float, Corrected] | None:
         if state.rho.any() and (1.0 + state.rho * ((x - state.reference) @ state.normals[0].T)).min() <= 0.05:
             return None  # a point lies behind a camera
-        cost, *work = settle(state, x, y, noise, variance_x, views)
-        return (cost, work) if np.isfinite(cost) else None
+        found = settle(state, x, y, noise, variance_x, views)
+        return found if np.isfinite(found[0]) else None
 
-    def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
-        r, corrected, weight = work
-        J = state.evaluate(corrected)[2]
-        WJ = (weight @ J).reshape(-1, J.shape[2])
-        return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
+    def normal_equations(state: State, work: Corrected) -> tuple[np.ndarray, np.ndarray]:
+        J = state.evaluate(work.points)[2]
+        WJ = (work.weight @ J).reshape(-1, J.shape[2])
+        return J.reshape(WJ.shape).T @ WJ, WJ.T @ work.residuals.ravel()
 
     with np.errstate(all="ignore"):  # a first step may be so long that its energy is not finite; it is then shortened
         # With a tolerance of 1e-10 the error is about a ten-thousandth of a standard deviation.
-        found = minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)
-    return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)
+        return minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)

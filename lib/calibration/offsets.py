@@ -276,13 +276,13 @@ def _steps(
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", Unsettled, stacklevel=4)
-    p, size = J_c.shape[2], offset.shape[1]
+    p = J_c.shape[2]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, J_x, frame[rows], landmark[rows], prior)
-    blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])
+    sd = np.sqrt(np.diag(full)[p:]).reshape(offset.shape)
     if score is not None:  # correlated errors count less
         p_value = float(chdtrc(score[0], score[1] * effective / len(r))) if score[0] else 1.0
-    learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
+    learnt = LandmarkOffsets(offset, sd, prior_sd, p_value)
     return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
 
 

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from lib.calibration.affine import camera_columns, estimate_noise, regress
 from lib.calibration.scatter import sandwich
-from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.least_squares import minimise
 
@@ -72,10 +71,9 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class ToolOffsets(Tool):
-    """An estimated tool, with the covariance of `offset_mm`, (k, 3, 3) mm^2, and the cameras estimated together with it."""
+    """An estimated tool, with the covariance of `offset_mm`, (k, 3, 3) mm^2, and the RMS error in an image."""
 
     covariance_mm2: np.ndarray
-    cameras: tuple[AffineCamera, ...]
     rms_px: float
 
 
@@ -193,8 +191,7 @@ def tool_offsets(
     sine, versine = np.zeros((2, k, 3))
     if half is not None:
         sine[on_jaw], versine[on_jaw] = np.split(offset[k:], 2)
-    cameras = tuple(AffineCamera(matrix[2 * c : 2 * c + 2]) for c in range(m // 2))
-    return ToolOffsets(offset[:k], sine, versine, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
+    return ToolOffsets(offset[:k], sine, versine, blocks, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
 
 
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:

@@ -115,7 +115,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(coarse_reach_px(rectification, images[1].shape) / CELL_PX))
-    left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
+    left, right = descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
     matches = _match(left, right, -reach, COARSE_OFF_LINE)[0]  # the volume is large
     # Keep matches with at least three neighbours on the lattice whose displacement is the same within 1.5 cells.
     gx, gy = matches.patch.max(axis=0, initial=0) + 1
@@ -128,7 +128,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     return (chosen.cell + step) * CELL_PX / scale
 
 
-def _descriptors(
+def descriptors(
     images: Images, masks: Masks, rectification: Rectification, range_cells: tuple[int, int], off_line: int,
     off_line_px: float = 0.0,
 ) -> list[np.ndarray]:  # fmt: skip
@@ -195,7 +195,7 @@ def _match_on(
         what = f"{high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB"
         budget = f"the budget is {budget_bytes / 2**30:.2f} GiB"
         raise ValueError(f"budget_bytes: {what}, {budget}. Narrow depth_range_mm, or take setting='fast'.")
-    left, right = _descriptors(images, masks, rectification, (low, high), off_line, off_line_px)
+    left, right = descriptors(images, masks, rectification, (low, high), off_line, off_line_px)
     found, volume, textured = _match(left, right, low, off_line, reciprocal=reciprocal)
     unique = found.uniqueness >= LEAST_UNIQUE
     x, y = torch.from_numpy(found.patch.T)

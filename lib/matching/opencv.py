@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.band import CELL_PX, DOWNSCALE, MAX_PIXELS, Images, Masks, Where, coarse_reach_px, plan_search
+from lib.matching.band import CELL_PX, MAX_PIXELS, Images, Masks, Where, coarse_reach_px, descriptors, plan_search
 from lib.matching.deepmatching import correlation_volume, peak_ratio
-from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
+from lib.matching.descriptors import PATCH, patch_quality
 from lib.matching.rectification import on_image, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
@@ -71,7 +71,7 @@ def match_with(
         return Matches.none(name)
     rectification, scale, (low, high), _ = plan
 
-    # Matchers only find points inside both canvases, so widen the canvas by the largest displacement.
+    # Matchers only find points inside both canvases, so widen the canvas by the largest displacement, rounded up.
     width, height = rectification.size_px
     reach = min(int(np.ceil(max(abs(low), abs(high)))), int(2 * coarse_reach_px(rectification, images[1].shape)))
     reach = -(-reach // LATTICE_PX) * LATTICE_PX
@@ -97,7 +97,9 @@ def match_with(
     kept = (target >= 0) & (target < size[0]) & valid_right[y, np.clip(target, 0, size[0] - 1)]
     x, y, d = x[kept], y[kept], d[kept]
     canvas = np.column_stack([x - reach, y]).astype(np.float64)
-    ratio, textured = _judge((left, right), (valid_left, valid_right), reach, (low, high), canvas.astype(int), -d)
+    cells = int(np.floor(low / CELL_PX)) - 1, int(np.ceil(high / CELL_PX)) + 1
+    grids = descriptors(images, masks, rectification, cells, 0)
+    ratio, textured = _judge(*grids, cells[0], canvas.astype(int), -d)
     matches = Matches(
         on_image(rectification.left_from_canvas, canvas),
         on_image(rectification.right_from_canvas, canvas - np.column_stack([d, np.zeros(len(d))])),
@@ -109,26 +111,18 @@ def match_with(
 
 
 def _judge(
-    images: Images, valid: Images, reach: int, range_px: tuple[float, float], points: np.ndarray, displacement: np.ndarray
+    left: np.ndarray, right: np.ndarray, low: int, points: np.ndarray, displacement: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Peak ratios (n,) of lattice points (n, 2) at displacements (n,), from DeepMatching's descriptors, since these matchers
     give none; and (n,) bool, True for points with texture: on flat patches a disparity is interpolated from neighbours.
 
-    `reach`, a multiple of the lattice's step, is the width of the margin that the canvases have on either side.
+    `left` and `right` are grids of `descriptors`, searched from `low` cells on.
     """
-    pairs = zip(images, valid, strict=True)
-    left, right = (pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in pairs)
-    margin = reach // CELL_PX
-    gy, gx = len(left) // PATCH, (left.shape[1] - 2 * margin) // PATCH
-    low = max(int(np.floor(range_px[0] / CELL_PX)) - 1, -margin)
-    n = min(int(np.ceil(range_px[1] / CELL_PX)) + 1, margin) - low + 1
-    left = np.ascontiguousarray(left[: gy * PATCH, margin : margin + gx * PATCH])
-    right = np.ascontiguousarray(right[: gy * PATCH, margin + low : margin + low + gx * PATCH + n - 1])
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), 0)
     x, y = points.T // LATTICE_PX
     index = np.rint(displacement / CELL_PX).astype(np.intp) - low
-    searched = (index >= 0) & (index < n)
+    searched = (index >= 0) & (index < volume.shape[3])
     ratio, along = np.full(len(points), np.nan), torch.from_numpy(index[searched])
     ratio[searched] = peak_ratio(volume[y[searched], x[searched]], torch.zeros_like(along), along)
     return ratio, patch_quality(left)[y, x]

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras import AffineCamera
 from lib.files import whole, write_bytes
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
@@ -115,15 +114,6 @@ def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None
         cloud.colors = o3d.utility.Vector3dVector(np.asarray(colours, dtype=np.float64) / 255)
     _write(path, lambda name: o3d.io.write_point_cloud(name, cloud), lambda data: len(data) >= x.nbytes)
     return path
-
-
-def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:
-    """Depth (h, w) float32 mm along the viewing direction at every left pixel, NaN outside the domain.
-
-    Depth 0 is the plane through the origin of the surface's frame, perpendicular to the view: an affine camera has no centre.
-    """
-    width, height = image_size_px
-    return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)
 
 
 def save_map(path: str | Path, values_mm: np.ndarray) -> Path:

@@ -100,7 +100,7 @@ def test_minimum_is_stationary(name):
     for j, s in enumerate(sd):
         for sign in (-1, 1):
             moved = found.state.moved(np.eye(len(sd))[j] * sign * 0.01 * s)
-            assert settle(moved, *data)[0] >= found.cost
+            assert settle(moved, *data)[0] >= found.energy
 
 
 def seen(rig, seed, n=200):

@@ -14,7 +14,6 @@ import pytest
 from scipy.spatial import KDTree
 
 from lib.surface import (
-    depth_map,
     fit_surface,
     open3d,
     save_map,
@@ -146,12 +145,12 @@ def test_ply_comes_back_with_colours(surface, image, bowl, tmp_path):
 
 
 def test_depth_map_is_the_surface_along_the_view(surface, bowl, tmp_path):
-    depth = depth_map(surface, bowl.rig.left, (1920, 1080))
+    depth = surface.on_grid(np.arange(1920), np.arange(1080)) @ bowl.rig.left.viewing_direction
     assert depth.shape == (1080, 1920) and np.isnan(depth[0, 0])
     x = surface([[700.0, 400.0]])[0]
     assert depth[400, 700] == pytest.approx(x @ bowl.rig.left.viewing_direction, abs=1e-5)
     path = save_map(tmp_path / "depth.tiff", depth)
-    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), depth)
+    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), depth.astype(np.float32))
 
 
 def test_bad_files_are_named_and_leave_nothing(surface, tmp_path):
