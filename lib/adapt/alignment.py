@@ -12,7 +12,7 @@ from lib.adapt.looking import Seen
 from lib.calibration import Calibration, CompetingCamerasError, calibrate, calibrate_as_shown
 from lib.calibration.offsets import Unsettled
 from lib.calibration.timing import clock_error, estimate_time_offset
-from lib.correspondences import MIN_CONFIDENCE, DataError
+from lib.correspondences import MIN_CONFIDENCE, TRAIN_FURTHER, DataError
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
@@ -91,7 +91,8 @@ def aligned(
         clock_sd_s = 1e-3 * fault.sd
         calibration = calibrated(recording)
     if fault is not None and fault.name != "jaw_opening":
-        raise RefusalError(f"robot: {fault.text} {fault.cure}")
+        cure = fault.cure.replace(TRAIN_FURTHER, "label some pairs by hand")
+        raise RefusalError(f"robot: {fault.text} {cure} {LABEL if cure != fault.cure else ''}".rstrip())
     if fault is None and not by_hand and (agreed := _agreeing(recording, seen, calibration)) is not seen:
         return aligned(recording, agreed, by_hand=by_hand)
     right = float(calibration.view_inliers.sum() / max(_reported(recording, seen), 1))

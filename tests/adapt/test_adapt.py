@@ -449,6 +449,7 @@ def test_a_robot_that_drifts_is_no_teacher_and_cameras_that_stand_still_are_not_
     found = adapt(record, StandIn(world.u, wrong=0.3), folder=tmp_path / "out", progress=False, tune=tune)
     assert not found.improved and not tune.calls
     assert "Images and robot disagree more and more" in found.report["reason"] and "stands still" in found.report["reason"]
+    assert "--labels" in found.report["reason"] and "lib adapt" not in found.report["reason"]  # it has just refused
 
 
 def test_a_log_may_hold_its_samples_and_not_stand_still():
