@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from lib.adapt.looking import Seen
 from lib.calibration import Calibration, CompetingCamerasError, calibrate, calibrate_as_shown
 from lib.calibration.offsets import Unsettled
 from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.correspondences import MIN_CONFIDENCE, TRAIN_FURTHER, DataError
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.recorded import Seen
 from lib.recordings import Recording
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.diagnosis import stated

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lib.adapt.looking import Seen
 from lib.adapt.teacher import RefusalError, Teacher
 from lib.correspondences import FEWEST_TO_TRAIN
 from lib.landmarks.metrics import errors_px, nees, tool_length_px
+from lib.landmarks.recorded import Seen
 from lib.recordings import Recording
 from lib.trust.health import feature_matches
 

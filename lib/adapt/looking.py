@@ -1,19 +1,15 @@
-"""Detections in some frames: anywhere, near the robot's report, or only where the image differs from the ground."""
+"""What detections in a recording reveal of their faults, and detection only where the image differs from the ground."""
 
 from collections.abc import Callable
-from typing import NamedTuple, Self
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from lib.calibration.offsets import OWN_BIAS
-from lib.correspondences import Correspondences, of_recording
-from lib.landmarks import with_ground
 from lib.landmarks.contrast import levelled
-from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.recorded import Seen
 from lib.recordings import Recording
-from lib.recordings.annotations import CLICK_SD_PX
 
 #: A detected tool stands still if it is in the same place, within this share of its length, in at least 4 frames.
 _STILL, _STILL_FRAMES = 0.15, 4
@@ -24,71 +20,13 @@ _SURE, _FEWEST_IMAGES = 0.5, 5  # least confidence of tips, and number of images
 _BASE_BIAS = 2.0
 
 
-class Seen(NamedTuple):
-    """Detections in m stereo frames: frame (m,), u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2) px^2, confidence (m, 2, 3)."""
-
-    frame: np.ndarray
-    u: np.ndarray
-    covariance: np.ndarray
-    confidence: np.ndarray
-
-    @classmethod
-    def by_hand(cls, u: np.ndarray) -> Self:
-        """Labels set by hand as detections: u (all frames, 2, 3, 2) px, NaN where there is none."""
-        frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
-        nothing = np.full((len(frames), 2, 3, 2), np.nan)
-        return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
-
-    @property
-    def stacked_px(self) -> np.ndarray:
-        """(m, 3, 4) px: left x, y, right x, y."""
-        return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
-
-    @property
-    def own_bias(self) -> np.ndarray:
-        """Standard deviations (3, 3) of the detector's constant errors: `OWN_BIAS`, and more if it is unsure of the base."""
-        along = self.u[:, :, 1:].mean(axis=2) - self.u[:, :, 0]
-        stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, self.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
-        own = OWN_BIAS.copy()
-        own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
-        return own
-
-    def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
-        """The detections paired with the robot's positions; those with a confidence below `least` do not count."""
-        known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
-        known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
-        return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
-
-    def of(self, frames: np.ndarray) -> Self:
-        """The detections of the given frames."""
-        return Seen(*(part[np.isin(self.frame, frames)] for part in self))
-
-    def labelled(self, u: np.ndarray) -> Self:
-        """A copy in which labels set by hand, u (all frames, 2, 3, 2) px or NaN, replace detections of their landmarks."""
-        u = u[self.frame]
-        known = np.isfinite(u).all(axis=-1)
-        covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
-        return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
-
-    def with_base(self, other: Self) -> Self:
-        """A copy with the bases of other detections in the same frames."""
-        parts = zip(self[1:], other[1:], strict=True)
-        return Seen(self.frame, *(np.concatenate([base[:, :, :1], tips[:, :, 1:]], axis=2) for tips, base in parts))
-
-
-def look(
-    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None, title: str = ""
-) -> Seen:
-    """Detect in some frames; with `near` (m, 2, 3, 2) px only the detector's later stages run, which search only there.
-
-    A progress bar is shown if it has a `title`.
-    """
-    found, known = [], with_ground(detector, recording)
-    for i, number in enumerate(tqdm(frames, desc=title, unit="pair", disable=not title)):
-        frame = recording.frames[int(number)]
-        pair = np.stack([frame.left, frame.right])
-        found.append(detector(pair, **known) if near is None else detector.near(pair, near[i], reach=NEAR, **known))
-    return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
+def own_bias(seen: Seen) -> np.ndarray:
+    """Standard deviations (3, 3) of the detector's constant errors: `OWN_BIAS`, and more if it is unsure of the base."""
+    along = seen.u[:, :, 1:].mean(axis=2) - seen.u[:, :, 0]
+    stated = np.sqrt(np.einsum("nci,ncij,ncj->nc", along, seen.covariance[:, :, 0], along)) / (along**2).sum(axis=2)
+    own = OWN_BIAS.copy()
+    own[0, 0] = max(own[0, 0], _BASE_BIAS * np.nanmedian(stated))
+    return own
 
 
 def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:

@@ -13,12 +13,13 @@ import numpy as np
 
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, sd_share, stretches
-from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
+from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.adapt.teacher import LABEL, OtherBaseError, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.recorded import Seen, look
 from lib.landmarks.shaft import ShaftEnd, shaft_axis, shaft_end
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording, read_image, smoothed

@@ -11,13 +11,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lib.adapt.alignment import LABEL, LEAST_RIGHT, POOR, RefusalError, aligned, clock, placed
-from lib.adapt.looking import Seen, frozen
+from lib.adapt.looking import frozen, own_bias
 from lib.calibration import Calibration, LandmarkOffsets
 from lib.calibration.offsets import OWN_BIAS, carried, robots_part, shown_axes, tool_axes
 from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.recorded import Seen
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
@@ -232,7 +233,7 @@ def teach(
         if fault is not None and not (alone or clicked):
             raise RefusalError(f"robot: {fault.text} {fault.cure} Or the detector marks other points than the tips. {LABEL}")
         turns = offsets.turns
-        own = 0.2 * OWN_BIAS if alone else (opinion or seen).own_bias
+        own = 0.2 * OWN_BIAS if alone else own_bias(opinion or seen)
         offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns

@@ -321,11 +321,9 @@ class Detector:
         """Use one thread for small windows, and torch's own number for whole frames."""
         return single_threaded_torch() if len(self.networks) > 1 else nullcontext()
 
-    def coarse(self, images: ArrayLike) -> Landmarks:
+    def coarse(self, images: np.ndarray) -> Landmarks:
         """Detect by the first stage alone."""
-        found, stride = self._measured(self.frame_peaks(images), None, "frame"), self.frame_stride(np.asarray(images))
-        u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
-        return Landmarks(u, covariance, found.confidence).without_unsure()
+        return self.refine(images, Landmarks.none(len(images)), "frame")
 
     def searched(self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, *, sweep: bool = False) -> Landmarks:
         """Choose where the later stages start: at `rough`, or, if its window does not show it well, at the best candidate.
@@ -399,14 +397,14 @@ class Detector:
         self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None, *, only: np.ndarray | None = None,
         reach: float | None = None,
     ) -> Landmarks:  # fmt: skip
-        """Refine the landmarks `rough` by a later stage, or by ``"tracking"``.
+        """Refine the landmarks `rough` by a stage, or by ``"tracking"``; the first stage does not use them.
 
         `seen` is the result of `stage_peaks` for them, if known; `only` and `reach` are its arguments.
         """
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only, reach)
         result = Landmarks.join([rough])  # a copy
         # While tracking, the previous frame's result is no evidence.
-        before = None if stage == "tracking" else Rough.in_windows(rough.u, rough.confidence, matrices, which)
+        before = None if stage in ("frame", "tracking") else Rough.in_windows(rough.u, rough.confidence, matrices, which)
         fine = self._measured(peaks, before, stage, which[:, 1:])
         u, back = view.unmapped(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
@@ -423,18 +421,19 @@ class Detector:
         result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence
         return result if stage == "tool" else result.without_unsure()  # the second look may be surer
 
-    def frame_peaks(self, images: ArrayLike) -> Peaks:
-        """Peaks of the first stage, in pixels of its input."""
-        return decode(self.outputs(self.reduced(as_uint8(images)), "frame"), self.frame_network.stride, method=self.method)
-
     def windows(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cut the inputs of a later stage around rough landmarks u (n, 3, 2); closeups may be limited to `only` (n, 3) bool.
+        """Cut a stage's inputs around rough landmarks u (n, 3, 2); closeups may be limited to `only` (n, 3) bool.
 
-        Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and the index (m, 2) of the image and landmark in
-        each window, or of the image (m,) for the tool.  Missing landmarks, and tools without base or tips, have no window.
+        Returns windows (m, h, w, 3) uint8; window_from_image (m, 2, 3); and the index (m, 2) of the image and landmark in
+        each window, or of the image (m,) if a window shows the whole tool.  Missing landmarks, and tools without base or
+        tips, have no window.  The first stage's windows are the whole images, whatever u is.
         """
+        if stage == "frame":
+            stride = self.frame_stride(images)
+            matrix = np.column_stack([np.diag(1 / stride), (1 / stride - 1) / 2])
+            return self.reduced(images), np.tile(matrix, (len(images), 1, 1)), np.arange(len(images))
         u = np.asarray(u, dtype=np.float64)
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)
         if stage in ("tool", "again"):
@@ -457,7 +456,7 @@ class Detector:
     def stage_peaks(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None, reach: float | None = None
     ) -> tuple[Peaks, np.ndarray, np.ndarray]:
-        """Peaks (m, 1) of a later stage in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2).
+        """Peaks (m, 1) of a stage in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2).
 
         `only` (n, 3) bool limits closeups to some landmarks.  In a window, which shows all three landmarks, only peaks within
         `reach` of u count, a share of the tool's length; None = all.
@@ -469,7 +468,7 @@ class Detector:
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
             return corrected(closeup_peaks(outputs, size), fit, size, which[:, 1:]), matrices, which
-        stride = self.tool_network.stride
+        stride = self.network_of(stage).stride
         if reach is not None:
             outputs = near_only(outputs, view.map_points(matrices[:, None], np.asarray(u)[which]), reach, stride)
         which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
@@ -493,7 +492,7 @@ class Detector:
             images = [cv2.resize(image, half, interpolation=method) for image in images]
         return np.stack([cv2.resize(image, size, interpolation=method) for image in images])
 
-    def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
+    def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray) -> Landmarks:
         """Convert peaks to landmarks in pixels of the stage's input; `landmark` is the index of each peak's landmark."""
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)

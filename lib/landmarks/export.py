@@ -80,13 +80,11 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
     rough, stride = detector(examples), detector.frame_stride(examples)
     result = {}
     for stage in detector.stages:
-        images, previous = detector.reduced(examples), ()
-        if stage != "frame":
-            images, matrices, which = detector.windows(examples, rough.u, stage)
-            if stage != "tracking":
-                i = which[:, 0] if which.ndim == 2 else which
-                parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
-                previous = tuple(torch.from_numpy(part).float() for part in parts)
+        (images, matrices, which), previous = detector.windows(examples, rough.u, stage), ()
+        if stage not in ("frame", "tracking"):
+            i = which[:, 0] if which.ndim == 2 else which
+            parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
+            previous = tuple(torch.from_numpy(part).float() for part in parts)
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
         inputs = as_tensor(images).contiguous(), *previous

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple, Self
 from zipfile import BadZipFile
 
 import numpy as np
@@ -12,10 +13,76 @@ from tqdm.auto import tqdm
 
 from lib import files, paths
 from lib.correspondences import Correspondences, of_recording
-from lib.landmarks.detector import Detector, Landmarks
+from lib.landmarks.detector import NEAR, Detector, Landmarks
 from lib.recordings import Ground, GrowingGround, Recording
+from lib.recordings.annotations import CLICK_SD_PX
 
 _ANY_GROUND = "any"  # in place of the ground's key, if the detector was sure and did not ask for it
+
+
+class Seen(NamedTuple):
+    """Detections in m stereo frames: frame (m,), u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2) px^2, confidence (m, 2, 3)."""
+
+    frame: np.ndarray
+    u: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+
+    @classmethod
+    def by_hand(cls, u: np.ndarray) -> Self:
+        """Labels set by hand as detections: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
+        nothing = np.full((len(frames), 2, 3, 2), np.nan)
+        return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
+
+    @property
+    def stacked_px(self) -> np.ndarray:
+        """(m, 3, 4) px: left x, y, right x, y."""
+        return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
+
+    def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
+        """The detections paired with the robot's positions; those with a confidence below `least` do not count."""
+        known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
+        known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
+        return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
+
+    def of(self, frames: np.ndarray) -> Self:
+        """The detections of the given frames."""
+        return Seen(*(part[np.isin(self.frame, frames)] for part in self))
+
+    def labelled(self, u: np.ndarray) -> Self:
+        """A copy in which labels set by hand, u (all frames, 2, 3, 2) px or NaN, replace detections of their landmarks."""
+        u = u[self.frame]
+        known = np.isfinite(u).all(axis=-1)
+        covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
+        return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
+
+    def with_base(self, other: Self) -> Self:
+        """A copy with the bases of other detections in the same frames."""
+        parts = zip(self[1:], other[1:], strict=True)
+        return Seen(self.frame, *(np.concatenate([base[:, :, :1], tips[:, :, 1:]], axis=2) for tips, base in parts))
+
+
+def look(
+    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None, track: bool = False,
+    title: str = "", leave: bool = True,
+) -> Seen:  # fmt: skip
+    """Detect in some frames, one after the other.
+
+    With `near` (m, 2, 3, 2) px only the detector's later stages run, which search only there; `track` as in `detect`.
+    A progress bar is shown if it has a `title`; with `leave` it stays when all is done.
+    """
+    found, known = [], with_ground(detector, recording)
+    for i, number in enumerate(tqdm(frames, desc=title, unit="pair", disable=not title, leave=leave)):
+        frame = recording.frames[int(number)]
+        pair = np.stack([frame.left, frame.right])
+        if near is not None:
+            found.append(detector.near(pair, near[i], reach=NEAR, **known))
+        elif track and found:
+            found.append(detector.track(pair, found[-1], **known))
+        else:
+            found.append(detector(pair, **known))
+    return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
 
 
 def detect(
@@ -40,13 +107,7 @@ def detect(
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     if not chosen.size:
         raise ValueError(f"frames: none of the {len(recording.frames)} frames of the recording; choose at least one.")
-    found, known = [], with_ground(detector, recording)
-    for i in tqdm(chosen, desc="landmarks", unit="pair", leave=False):
-        frame = recording.frames[int(i)]
-        pair = np.stack([frame.left, frame.right])
-        found.append(detector.track(pair, found[-1], **known) if track and found else detector(pair, **known))
-    u, covariance, confidence = (np.stack([part[::2], part[1::2]], axis=2) for part in vars(Landmarks.join(found)).values())
-    return of_recording(recording, u[:, :, 0], u[:, :, 1], frames=chosen, covariance_px2=covariance, confidence=confidence)
+    return look(recording, detector, chosen, track=track, title="landmarks", leave=False).rows(recording)
 
 
 def with_ground(detector: Callable, recording: Recording | GrowingGround, change: Callable | None = None) -> dict:

@@ -139,10 +139,7 @@ def motion_blur(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
     if (length := float(np.hypot(*shift_px))) < 0.3:
         return image
     half = int(np.ceil(length / 2)) + 1
-    kernel = np.zeros((2 * half + 1,) * 2, np.float32)
-    for t in np.linspace(-0.5, 0.5, 4 * half + 1):
-        x, y = t * shift_px + half
-        i, j = int(np.floor(y)), int(np.floor(x))
-        fy, fx = y - i, x - j
-        kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
-    return cv2.filter2D(image, -1, kernel / kernel.sum())
+    t = np.linspace(-0.5, 0.5, 4 * half + 1)[:, None]
+    # At each t the kernel is a point at t * shift_px, shared between its four pixels in proportion (bilinear).
+    x, y = (np.clip(1 - np.abs(np.arange(-half, half + 1) - t * along), 0, 1) for along in shift_px)
+    return cv2.filter2D(image, -1, np.float32(y.T @ x / len(t)))

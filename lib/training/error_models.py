@@ -10,7 +10,6 @@ from scipy.optimize import minimize
 from scipy.special import chdtri, chndtr, expit
 from tqdm.auto import tqdm
 
-from lib.geometry import cell_from_image
 from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
 from lib.landmarks.error_model import FEATURES, ErrorModel, Rough, features_of
 from lib.landmarks.metrics import GROSS_PX, tool_length_px
@@ -124,27 +123,19 @@ class Seen(NamedTuple):
         return best, bias
 
 
-def seen_by(
-    detector: Detector, stage: str, labelled: LabelledImage, rough: Landmarks | None, found: tuple | None = None
-) -> Seen:
+def seen_by(detector: Detector, stage: str, labelled: LabelledImage, rough: Landmarks, found: tuple) -> Seen:
     """Compare a stage's peaks in one image with the labels, given the landmarks `rough` of the previous stage.
 
-    `found` is the result of `Detector.stage_peaks`, if known.
+    `found` is the result of `Detector.stage_peaks` for them.
     """
-    labels, image = labelled.in_view, labelled.image[None]
+    labels = labelled.in_view
     # A stage that only guides the next one is correct if the next one can find the landmark there.
     share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
     tolerance, label_sd = np.repeat(share * tool_length_px(labelled.u), 3), np.broadcast_to(labelled.sd_px, 3)
     known = (np.isfinite(labels).all(1) & np.isfinite(tolerance)) | (labelled.visibility == 0)
-    if stage == "frame":
-        peaks, stride = detector.frame_peaks(image), detector.frame_stride(image)
-        errors = peaks.u[0].double().numpy() - cell_from_image(labels, stride)
-        tolerance, label_sd = tolerance / stride.mean(), label_sd / stride.mean()
-        features, moved = features_of(peaks.double())[0].numpy(), np.zeros((3, 2))
-        return Seen(features, errors, tolerance, np.arange(3), moved, known, label_sd)
-    peaks, matrices, which = found or detector.stage_peaks(image, rough.u, stage)
+    peaks, matrices, which = found
     landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
-    before = None if stage == "tracking" else Rough.in_windows(rough.u, rough.confidence, matrices, which)
+    before = None if stage in ("frame", "tracking") else Rough.in_windows(rough.u, rough.confidence, matrices, which)
     features = features_of(peaks.double(), before)
     feature, moved = features[:, 0].numpy(), np.zeros(at.shape)
     keep = np.ones(len(at), bool)
@@ -197,7 +188,7 @@ def fit_error_models(
     n, images, before = len(images), [*images, *for_closeups], detector.error_models
     # Closeups are fitted on their full corrections, not on those scaled by an earlier gain.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
-    rough: list[Landmarks | None] = [None] * len(images)
+    rough = [Landmarks.none(1)] * len(images)
     rng = np.random.default_rng(0)
     for stage in detector.stages:
         parts, found = [], []
@@ -208,7 +199,7 @@ def fit_error_models(
                 moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1) * tool_length_px(start.u) / _LENGTH_PX
                 start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
                 start = detector.refine(labelled.image[None], start, stage)
-            found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
+            found.append(detector.stage_peaks(labelled.image[None], start.u, stage))
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
         if stage in ("closeup", "closer"):  # their confidence is fitted on `images` alone
             parts[n:] = (part._replace(known=np.zeros_like(part.known)) for part in parts[n:])

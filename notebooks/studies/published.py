@@ -11,6 +11,7 @@ import numpy as np
 from lib import paths
 from lib.geometry import cell_from_image, image_from_cell
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.heatmaps import decode
 from lib.landmarks.network import StackedHourglass
 from lib.training.loop import load_training
 from lib.training.samples import LabelledImage
@@ -44,7 +45,7 @@ class PublishedDetector:
     def __call__(self, images: np.ndarray) -> Landmarks:
         """Landmarks of images (n, h, w, 3), in their own pixels; the confidence is the height of the peak."""
         small = np.stack([cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA) for image in images])
-        peaks = Detector(self.network, method="paper").frame_peaks(small)
+        peaks = decode(Detector(self.network).outputs(small, "frame"), self.network.stride, method="paper")
         u = image_from_cell(peaks.u.numpy(), np.array(images.shape[2:0:-1]) / self.size_px)
         return Landmarks(u, np.full((*u.shape, 2), np.nan), peaks.value.numpy().clip(0, 1))
 

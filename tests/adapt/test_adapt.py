@@ -15,11 +15,12 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, alignment, judging, looking, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
-from lib.adapt.looking import Seen, at_rest, exchanged_tips, look, look_elsewhere
+from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.correspondences import DataError
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.recorded import Seen, look
 from lib.landmarks.shaft import AHEAD, ShaftEnd
 from lib.recordings import Kinematics, Scene
 from lib.recordings.annotations import Annotations, write_coco

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lib.adapt import teach
-from lib.adapt.looking import look
 from lib.landmarks import shaft
+from lib.landmarks.recorded import look
 from lib.landmarks.shaft import AHEAD, ShaftEnd, shaft_axis, shaft_end
 from lib.recordings import StereoFrame
 from tests.adapt.world import StandIn, World

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lib.landmarks.heatmaps import decode
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.training.samples import LabelledImage
 from notebooks.studies import published
@@ -29,14 +30,18 @@ def test_the_way_back_ends_in_full_frames(monkeypatch):
     detector = PublishedDetector(StackedHourglass(HourglassConfig(4, 1, 2)).eval(), RESOLUTIONS["480x640"])
     small = {}
 
-    def seen(self, images):
+    def outputs(self, images, stage):
         small["shape"] = images.shape
-        peaks = original(self, images)
+        return original(self, images, stage)
+
+    def decoded(heatmaps, stride, *, method):
+        peaks = decode(heatmaps, stride, method=method)
         peaks.u[:] = peaks.u.new_tensor([100.0, 50.0])
         return peaks
 
-    original = published.Detector.frame_peaks
-    monkeypatch.setattr(published.Detector, "frame_peaks", seen)
+    original = published.Detector.outputs
+    monkeypatch.setattr(published.Detector, "outputs", outputs)
+    monkeypatch.setattr(published, "decode", decoded)
     found = detector(np.zeros((2, 1080, 1920, 3), np.uint8))
     assert small["shape"] == (2, 480, 640, 3)
     np.testing.assert_allclose(found.u, np.broadcast_to([100.5 * 3 - 0.5, 50.5 * 2.25 - 0.5], (2, 3, 2)))
