@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from lib import files, paths
+from lib.adapt.candidates import choose
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, sd_share, stretches
 from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.adapt.teacher import LABEL, OtherBaseError, RefusalError, Teacher, longest_still, teach
@@ -22,17 +23,16 @@ from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.recorded import Seen, look
 from lib.landmarks.shaft import ShaftEnd, shaft_axis, shaft_end
 from lib.provenance import Provenance, plain
-from lib.recordings import Recording, read_image, smoothed
-from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
-from lib.training.evaluation import evaluate
-from lib.training.samples import LabelledImage, shown_by_coco
+from lib.recordings import Recording, smoothed
+from lib.recordings.annotations import CLICK_SD_PX, read_coco
+from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 33  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 34  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -127,53 +127,6 @@ def adapt(
         return Adaptation(work.detector, None, work.finished(), False, {})
 
 
-def adapt_images(
-    images: str | Path, labels: str | Path, detector: Detector, *, minutes: float = 20.0, seed: int = 0,
-    folder: str | Path | None = None, progress: bool = True, tune: Callable[..., Detector] = finetune,
-) -> Adaptation:  # fmt: skip
-    """`adapt` without a robot: at least 10 images of one camera in the folder `images`, with `labels` (COCO keypoints).
-
-    In the order of their names, the first 65 % train, the next 15 % fit the error models, and the last 20 % judge.
-    """
-    images, marked = Path(images), []
-    for name, names, values in sorted(coco_keypoints(Path(labels)), key=lambda entry: entry[0]):
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ValueError(f"{labels}: {name} lies outside {images}; give file names inside it.")
-        if not set(LANDMARKS) <= set(names):
-            raise ValueError(f"{labels}: image {name} has keypoints {names}; {list(LANDMARKS)} are needed.")
-        xyv = values[[names.index(landmark) for landmark in LANDMARKS]]
-        u, shown = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan), shown_by_coco(xyv[:, 2].astype(int))
-        if np.isfinite(tool_length_px(u)):
-            marked.append(LabelledImage(name, read_image(images / name), u, shown, CLICK_SD_PX))
-    n = len(marked)
-    if n < 10:
-        raise ValueError(f"{labels}: {n} images with a labelled base and tip; label at least 10.")
-    second = min(round(0.8 * n), n - 3)
-    first = min(round(0.65 * n), second - 2)
-    parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
-    report = {"recording": images.name, "weights": getattr(detector, "digest", "")[:12], "minutes": minutes, "seed": seed}
-    report |= {"notes": [], "rounds": [], "frames": {name: len(part) for name, part in parts.items()}}
-    key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS, RECIPE]
-    key += [files.digest(*(one.image.tobytes() for one in marked))]
-    provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
-    simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
-    how = {"minutes": minutes, "steps": STEPS, "seed": seed, "progress": progress}
-    tuned = tune(detector, parts["learn"], parts["stop"], _work_folder(folder, images.name, key), simulated=simulated, **how)
-    before, after = (evaluate(one, parts["judge"]) for one in (detector, tuned))
-    gain, sd = better(*(frame_means(found.error_px / found.length_px[:, None]) for found in (before, after)))
-    improved = bool(gain > 2 * sd)
-    report["judged"] = {
-        name: {"median_px": s.median_px, "within_1_percent": s.pck_0_01, "within_5_percent": s.pck_0_05}
-        for name, s in (("before", before.scores), ("after", after.scores))
-    }
-    report |= {
-        "gain": {"labels": [gain, sd]}, "improved": improved,
-        "reason": "the images for judging agree better with their labels" if improved else
-        "on the images for judging the gain may be due to chance",
-    }  # fmt: skip
-    return Adaptation(tuned if improved else detector, None, plain(provenance.so_far() | report), improved, {})
-
-
 class _Work:
     """An adaptation in progress: the recording, the files with intermediate results, the time left, the report so far."""
 
@@ -206,7 +159,7 @@ class _Work:
         key += [recording.kinematics.time_s.tobytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in shown)]
         digest = getattr(self.detector, "digest", "")  # of the detector that learns
         key += [digest, Path(labels).read_bytes() if labels is not None else b""]
-        self.folder = _work_folder(folder, recording.name, key)
+        self.folder = work_folder(folder, recording.name, key)
         self.folder.mkdir(parents=True, exist_ok=True)
         state = self.folder / "state.json"
         spent_s = json.loads(state.read_text(encoding="utf-8"))["seconds"] if state.is_file() else 0.0
@@ -345,7 +298,25 @@ class _Work:
         return self.judged(first, best, best_seen, teacher)
 
     def taught(self, seen: Seen, by_hand: Seen | None) -> Teacher:
-        """The first teacher.  The detector may mark the kink of angled jaws instead of the base.
+        """The first teacher, by the detections or, if they do not teach, by those candidates that move with the robot."""
+        try:
+            return self.with_any_base(seen, by_hand)
+        except RefusalError as refused:
+            if by_hand is not None or not self.looks_near or self.detector.tool_network is None:
+                raise
+            chosen = self.kept("chosen", partial(choose, self.recording, self.detector, seen, self.seed))
+            try:
+                teacher = self.with_any_base(chosen, by_hand)
+            except RefusalError:
+                raise refused from None
+            self.report["notes"].append(
+                f"The detections do not teach ({str(refused).partition('. ')[0]}). So the robot's motion chose among several "
+                f"candidates in each image: {100 * np.isfinite(chosen.u).all((2, 3)).mean():.0f} % of the images show one."
+            )
+            return teacher
+
+    def with_any_base(self, seen: Seen, by_hand: Seen | None) -> Teacher:
+        """A first teacher.  The detector may mark the kink of angled jaws instead of the base.
 
         Then the tips alone give the cameras, and the base is detected near the robot's.
         """
@@ -477,7 +448,7 @@ class _Work:
         )  # fmt: skip
 
 
-def _work_folder(folder: str | Path | None, name: str, key: list) -> Path:
+def work_folder(folder: str | Path | None, name: str, key: list) -> Path:
     """The folder of an adaptation's intermediate results, a separate one for each `key`."""
     return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / files.digest(repr(key).encode())
 

@@ -8,7 +8,8 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import files, paths
-from lib.adapt.loop import Adaptation, adapt, adapt_images
+from lib.adapt.images import adapt_images
+from lib.adapt.loop import Adaptation, adapt
 from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.shaft import outlined

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, alignment, judging, looking, loop, report, teach, teacher
+from lib.adapt import RefusalError, adapt, alignment, images, judging, looking, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
@@ -51,7 +51,8 @@ def recording(world, tmp_path_factory):
 def short(monkeypatch):
     """One round, and no simulated frames."""
     monkeypatch.setattr(loop, "ROUNDS", 1)
-    monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
+    for module in (loop, images):
+        monkeypatch.setattr(module, "simulated_like", lambda *_: [])
 
 
 def taught(recording, detector):
@@ -273,7 +274,7 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
         return teach(recording, seen, **how)
 
     class Kinked(StandIn):
-        networks, closeup_network, digest = {}, "some", ""
+        networks, closeup_network, tool_network, digest = {}, "some", None, ""
 
         def near(self, images, u, *, reach):
             asked.append(u)
@@ -747,7 +748,7 @@ def test_a_landmark_that_robot_and_detector_leave_open_asks_for_labels(world, re
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
     class Lost(StandIn):
-        networks, closeup_network, stages, near = {}, "some", ("frame", "closeup"), Detector.near
+        networks, closeup_network, tool_network, stages, near = {}, "some", None, ("frame", "closeup"), Detector.near
         refine = staticmethod(lambda pair, rough, stage, *, reach: Landmarks.none(2))
 
     class ReachedError(Exception):
@@ -903,22 +904,22 @@ def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
         return tune(detector, [one._replace(name=f"left {int(one.name[5:11])}") for one in images], held_out, folder, **how)
 
     how = {"detector": StandIn(world.u, wrong=0.5), "folder": tmp_path, "progress": False, "tune": tuned}
-    found = loop.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    found = images.adapt_images(recording.folder, tmp_path / "labels.json", **how)
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0] + 0.5, np.full_like(u[:, 1], np.nan)), SIZE, ".png")
-    loop.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    images.adapt_images(recording.folder, tmp_path / "labels.json", **how)
     assert folders[0] != folders[1]  # a training with other labels is no training to resume
     assert found.improved and found.calibration is None
     assert sum(found.report["frames"].values()) == 20 and found.report["judged"]["after"]["median_px"] < 0.5
     write_coco(tmp_path / "ten.json", Annotations(u[:20, 0], np.full_like(u[:20, 1], np.nan)), SIZE, ".png")
-    ten = loop.adapt_images(recording.folder, tmp_path / "ten.json", **how)
+    ten = images.adapt_images(recording.folder, tmp_path / "ten.json", **how)
     assert ten.report["frames"] == {"learn": 5, "stop": 2, "judge": 3} and np.isfinite(ten.report["gain"]["labels"][1])
     absent = np.where(np.arange(20)[:, None] < 9, 2, -1) * np.ones(3, int)
     one_eye = Annotations(u[:20, 0], np.full_like(u[:20, 1], np.nan), absent, 0 * absent)
     write_coco(tmp_path / "nine.json", one_eye, SIZE, ".png")
     with pytest.raises(ValueError, match="at least 10"):  # images without a tool cannot judge
-        loop.adapt_images(recording.folder, tmp_path / "nine.json", StandIn(world.u), folder=tmp_path, tune=tune)
+        images.adapt_images(recording.folder, tmp_path / "nine.json", StandIn(world.u), folder=tmp_path, tune=tune)
     with pytest.raises(ValueError, match="at least 10"):
-        loop.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
+        images.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
 
 
 def _few(folder):
