@@ -353,7 +353,7 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
 
 
 def _write_points(path: Path, found: Reconstruction) -> None:
-    sd_mm = np.sqrt(np.diagonal(found.points.covariance_mm2, axis1=1, axis2=2))  # by the matches alone
+    sd_mm = np.sqrt(np.diagonal(found.points.covariance_mm2, axis1=1, axis2=2))  # without the cameras' part
     names = ["left_x_px", "left_y_px", "right_x_px", "right_y_px", "x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]
     table = np.hstack([found.u, found.matches.u_right, found.points.x_mm, sd_mm])
     with files.whole(path) as new:

@@ -35,7 +35,7 @@ class Reconstruction:
 
     Attributes:
         surface: Fitted to `points` over the left image points `u`.
-        points: The triangulated points, with their covariances.
+        points: The triangulated points.  Their covariances are those of the matches, or larger: see `as_scattered`.
         matches: The matches that passed the epipolar filter, and whose points have neighbours; one for each point.
         n_matches: Number of matches before these filters.
         mask_left: (h, w) bool, True where tool, glints or darkness hid the surface.
@@ -87,6 +87,24 @@ def in_company(x_mm: np.ndarray) -> np.ndarray:
     """Mask (n,) of the points that are not alone: between textured parts a surface would pass through a wrong one."""
     third = KDTree(x_mm).query(x_mm, k=4)[0][:, 3]  # the first is the point itself; infinite with fewer points
     return third <= _ALONE * np.median(third) if len(x_mm) else np.zeros(0, dtype=bool)
+
+
+def as_scattered(points: Points, off_mm: np.ndarray, view: np.ndarray, inliers: np.ndarray) -> Points:
+    """The points with larger covariances, if they scatter about the surface more than these state.
+
+    A matcher cannot know all its errors: noise, focus and texture of the images differ.  The distances `off_mm` (n, 3) of
+    the points from a surface show most of them.  So the covariances are scaled to the median distance of the `inliers`
+    along `view` (3,), but never made smaller.
+
+    >>> rng = np.random.default_rng(0)
+    >>> points = Points(np.zeros((999, 3)), np.tile(0.01 * np.eye(3), (999, 1, 1)), np.zeros(999))
+    >>> scaled = as_scattered(points, rng.normal(0, 0.3, (999, 3)), np.array([0, 0, 1.0]), np.full(999, True))
+    >>> float(scaled.covariance_mm2[0, 2, 2].round(1))
+    0.1
+    """
+    sd_mm = np.sqrt(np.einsum("i,nij,j->n", view, points.covariance_mm2, view))
+    ratio = 1.4826 * float(np.median(np.abs(off_mm @ view)[inliers] / sd_mm[inliers]))
+    return replace(points, covariance_mm2=points.covariance_mm2 * max(ratio, 1.0) ** 2)
 
 
 def refine_rig(calibration: Calibration, matches: Matches) -> StereoRig:
@@ -213,6 +231,7 @@ def reconstruct(
         off = _off_lines(rig, matches)[kept, None]
         inflation = float(sign_inflation(surface.grid, matches.u_left[kept], off, _SHARED_CELLS)[0])
         surface = replace(surface, fit=replace(surface.fit, inflation=inflation))
+        points = as_scattered(points, points.x_mm - surface(matches.u_left), rig.left.viewing_direction, kept)
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 
 

@@ -371,3 +371,17 @@ def test_real_pairs_are_scored_beside_each_other():
 def test_real_pair_files_are_checked(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"left\.png"):
         evaluation.real_pair(tmp_path)
+
+
+@pytest.mark.parametrize("noise", [0.0, 14.0])
+def test_points_scatter_as_their_covariances_state_also_in_images_that_the_matcher_does_not_know(scene, noise):
+    rng = np.random.default_rng(5)
+    views = (cv2.GaussianBlur(image, (0, 0), 1.5) if noise else image for image in (scene.left, scene.right))
+    left, right = (np.clip(image + rng.normal(0, noise, image.shape), 0, 255).astype(np.uint8) for image in views)
+    found = reconstruct(left, right, scene.rig, u_landmarks=scene.u_tool, control=(10, 7))
+    view, rig = scene.rig.left.viewing_direction, scene.rig
+    of_matches = rig.triangulate(found.matches.u_left, found.matches.u_right, found.matches.covariance_px2)
+    sd = [np.sqrt(np.einsum("i,nij,j->n", view, one.covariance_mm2, view)) for one in (found.points, of_matches)]
+    off = np.abs((found.points.x_mm - scene.truth(found.u)) @ view)
+    stated, matches = (1.4826 * float(np.nanmedian(off / one)) for one in sd)
+    assert 0.7 < stated < 1.5 and (not noise or matches > 1.1 * stated)
