@@ -32,6 +32,7 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
+_BRIDGED_S = 0.1  # the motion is smooth for so long: samples that were dropped within it are interpolated
 _GAP_S = 0.5  # a step between samples that is longer than this and than five usual steps is not interpolated
 _FARTHEST_MM = 1e5  # coordinates beyond this cannot be in millimetres
 _ORDER = "time_s must be a number, larger than in the row before"
@@ -78,22 +79,27 @@ class Kinematics:
     def at(self, time_s: ArrayLike) -> np.ndarray:
         """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
-        NaN before the first sample, after the last, next to a dropped one, and in steps over 0.5 s and five usual steps.
+        NaN before the first sample, after the last, in steps over 0.5 s and five usual steps, and where samples were dropped
+        for longer than 0.1 s, as between the neighbours of one that was dropped from a slow log.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
         if time.ndim != 2 or time.shape[1] != k:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
-        x, known = np.empty((*time.shape, 3)), time[np.isfinite(time)]
+        x, known = np.full((*time.shape, 3), np.nan), time[np.isfinite(time)]
         # A log may have a million samples, of which a frame needs few.
-        low, high = np.searchsorted(self.time_s, (known.min(), known.max())) if known.size else (0, 0)
+        span_s = (known.min() - _BRIDGED_S, known.max() + _BRIDGED_S) if known.size else (0.0, 0.0)
+        low, high = np.searchsorted(self.time_s, span_s)
         near_s, near_mm = (part[max(low - 2, 0) : high + 2] for part in (self.time_s, self.x_mm))
-        for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
-            x[:, landmark, axis] = np.interp(time[:, landmark], near_s, near_mm[:, landmark, axis], np.nan, np.nan)
-        if len(near_s) > 1:
-            before = np.clip(np.searchsorted(near_s, time, side="right") - 1, 0, len(near_s) - 2)
-            long = (np.diff(near_s) > self._longest_step_s)[before]
-            x[long & (time != near_s[before]) & (time != near_s[before + 1])] = np.nan
+        for landmark, at_s in enumerate(time.T):  # exactly on a sample, a dropped neighbour has no effect
+            there = np.flatnonzero(np.isfinite(near_mm[:, landmark]).all(axis=1))
+            own_s, own_mm = near_s[there], near_mm[there, landmark]
+            for axis in range(3 if there.size else 0):
+                x[:, landmark, axis] = np.interp(at_s, own_s, own_mm[:, axis], np.nan, np.nan)
+            if there.size > 1:
+                before = np.clip(np.searchsorted(own_s, at_s, side="right") - 1, 0, there.size - 2)
+                long = np.diff(own_s) > np.where(np.diff(there) > 1, _BRIDGED_S, self._longest_step_s)
+                x[long[before] & (at_s != own_s[before]) & (at_s != own_s[before + 1]), landmark] = np.nan
         return x
 
     @cached_property

@@ -150,6 +150,20 @@ def test_dropped_samples_do_not_spread():
     np.testing.assert_array_equal(Kinematics(np.array([1.0]), x[:1]).at([1.0, 2.0])[0], x[0])
 
 
+def test_short_drops_of_a_fast_log_are_interpolated_and_long_ones_are_not():
+    time_s = np.arange(0, 2, 0.002)
+    x = time_s[:, None, None] * np.ones((3, 3))
+    dropped = x.copy()
+    dropped[[0, 100, 101, 400], 1] = np.nan
+    dropped[500:700] = np.nan
+    kinematics, at_s = Kinematics(time_s, dropped), np.array([0.001, 0.1999, 0.2, 0.2011, 0.801, 1.2, 1.5])
+    found = kinematics.at(at_s)
+    assert np.isnan(found[0, 1]).all() and np.isfinite(found[0, [0, 2]]).all() and np.isnan(found[5]).all()
+    np.testing.assert_allclose(found[[1, 2, 3, 4, 6]], at_s[[1, 2, 3, 4, 6], None, None] * np.ones((3, 3)), atol=1e-12)
+    for one, t in zip(found, at_s, strict=True):  # a single time reads a part of the log
+        np.testing.assert_array_equal(kinematics.at([t])[0], one)
+
+
 def test_dropped_samples_survive_the_round_trip(tmp_path):
     x = tool(5)
     x[3] = np.nan

@@ -627,6 +627,7 @@ def test_an_offset_of_the_base_of_a_pivoting_tool_is_named_with_its_size(offset_
     best = diagnose(pivoting(offset_mm)).best
     assert best.name == "landmark_offset" and best.text.split(": ")[1].startswith("base by")
     assert best.value == pytest.approx(600, abs=100)
+    assert f"0.60 mm too {'short' if offset_mm[0] > 0 else 'long'}" in best.cure
 
 
 @pytest.mark.parametrize(("opening_mm", "named"), [((0.5, 1.4), "same_tips"), ((0.02, 0.05), None)])
