@@ -45,7 +45,7 @@ def several(detector: Detector, image: np.ndarray, first: np.ndarray) -> np.ndar
     order = [i for i in np.argsort(-likely) if likely[i] >= _LIKELY]
     found: list[np.ndarray] = []
     for tool in (first, *u[order]):
-        apart = [np.linalg.norm(tool - other, axis=1).mean() / tool_length_px(other[None])[0] for other in found]
+        apart = [np.linalg.norm(tool - other, axis=1).mean() / max(tool_length_px(other[None])[0], 1.0) for other in found]
         if np.isfinite(tool).all() and min(apart, default=1.0) > _APART:
             found.append(tool)
     return np.concatenate([np.array(found).reshape(-1, 3, 2), np.full((_MOST, 3, 2), np.nan)])[:_MOST]
