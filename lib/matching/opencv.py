@@ -97,7 +97,7 @@ def match_with(
     kept = (target >= 0) & (target < size[0]) & valid_right[y, np.clip(target, 0, size[0] - 1)]
     x, y, d = x[kept], y[kept], d[kept]
     canvas = np.column_stack([x - reach, y]).astype(np.float64)
-    cells = int(np.floor(low / CELL_PX)) - 1, int(np.ceil(high / CELL_PX)) + 1
+    cells = int(np.floor(max(low, -reach) / CELL_PX)) - 1, int(np.ceil(min(high, reach) / CELL_PX)) + 1
     grids = descriptors(images, masks, rectification, cells, 0)
     ratio, textured = _judge(*grids, cells[0], canvas.astype(int), -d)
     matches = Matches(
