@@ -91,7 +91,7 @@ def aligned(
         clock_sd_s = 1e-3 * fault.sd
         calibration = calibrated(recording)
     if fault is not None and fault.name != "jaw_opening":
-        cure = fault.cure.replace(TRAIN_FURTHER, "label some pairs by hand")
+        cure = fault.cure.replace(TRAIN_FURTHER, "give labels")  # training has just been refused
         raise RefusalError(f"robot: {fault.text} {cure} {LABEL if cure != fault.cure else ''}".rstrip())
     if fault is None and not by_hand and (agreed := _agreeing(recording, seen, calibration)) is not seen:
         return aligned(recording, agreed, by_hand=by_hand)

@@ -302,11 +302,12 @@ class _Work:
         try:
             return self.with_any_base(seen, by_hand)
         except RefusalError as refused:
-            if by_hand is not None or not self.looks_near or self.detector.tool_network is None:
+            if by_hand is not None or not self.looks_near:
                 raise
             chosen = self.kept("chosen", partial(choose, self.recording, self.detector, seen, self.seed))
+            self.axis = None  # it may rest on wrong cameras
             try:
-                teacher = self.with_any_base(chosen, by_hand)
+                teacher = self.with_any_base(chosen.labelled(self.labels), None, name="base of the chosen")
             except RefusalError:
                 raise refused from None
             self.report["notes"].append(
@@ -315,10 +316,10 @@ class _Work:
             )
             return teacher
 
-    def with_any_base(self, seen: Seen, by_hand: Seen | None) -> Teacher:
+    def with_any_base(self, seen: Seen, by_hand: Seen | None, name: str = "base") -> Teacher:
         """A first teacher.  The detector may mark the kink of angled jaws instead of the base.
 
-        Then the tips alone give the cameras, and the base is detected near the robot's.
+        Then the tips alone give the cameras, and the base is detected near the robot's; `name` is that of these detections.
         """
         try:
             return teach(self.recording, seen, by_hand=by_hand)
@@ -327,7 +328,7 @@ class _Work:
                 raise
             try:
                 tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
-                near = self.near("base", self.detector, seen.frame, tips)
+                near = self.near(name, self.detector, seen.frame, tips)
                 teacher = teach(self.recording, seen.with_base(near), by_hand=by_hand)
             except RefusalError:
                 raise refused from None

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from lib.correspondences import Correspondences
+from lib.matching import dark_mask
 from lib.recordings import Doubt, Recording
 from lib.trust.diagnosis import Diagnosis
 from lib.trust.fitting import Hypothesis
@@ -46,16 +47,23 @@ def blurred(recording: Recording, frames: np.ndarray) -> list[Doubt]:
     for side, own, other in (("left", left, right), ("right", right, left)):
         found = (own < _BLURRED * other).any(axis=1)
         if found.mean() > _OFTEN:
-            text = f"In {100 * found.mean():.0f} % of the frames, first in frame {frames[found][0]}, the {side} image shows "
-            text += f"less than {100 * _BLURRED:.0f} % of the other's fine detail: out of focus, covered, or scaled up."
+            text = f"In {found.sum()} of {len(frames)} compared frames, first in frame {frames[found][0]}, the {side} image "
+            text += f"has less than {100 * _BLURRED:.0f} % of the other's fine detail: out of focus, covered, or scaled up."
             cure = f"Focus and clean the {side} eye, record both eyes at full size, and leave out what is blurred."
             return [Doubt("blurred", text, cure)]
     return []
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """(3,) contrasts of details of 2, 4 and 8 px relative to that of 16 px, 0 in a blank image.  Single pixels are noise."""
-    grey = [np.log(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) + np.float32(8))]
+    """(3,) contrasts of details of 2, 4 and 8 px relative to that of 16 px, 0 in a blank image.  Single pixels are noise.
+
+    What is dark around a round field does not count.
+    """
+    x, y, width, height = cv2.boundingRect((~dark_mask(image)).view(np.uint8))
+    if not width:
+        return np.zeros(_SIZES)
+    field = np.ascontiguousarray(image[y : y + height, x : x + width])
+    grey = [np.log(cv2.cvtColor(field, cv2.COLOR_RGB2GRAY) + np.float32(8))]
     for _ in range(_SIZES + 2):
         grey.append(cv2.pyrDown(grey[-1]))
     *sizes, coarse = (np.median(np.abs(a - cv2.pyrUp(b, dstsize=a.shape[::-1]))) for a, b in pairwise(grey[1:]))

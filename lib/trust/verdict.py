@@ -148,7 +148,7 @@ def judge(
         epipolar_px: Median epipolar distance of features matched between the two images, independent of the tool.
         epipolar_at_mm: (k, 3) positions of these features by the calibration; None assumes that they are near the tool.
         robot_accuracy_mm: Standard deviation of the robot's position per coordinate, as the manufacturer states it.
-        doubts: The doubts of the recording (`lib.recordings.Recording.doubts`).
+        doubts: Those of the recording (`lib.recordings.Recording.doubts`) and of its images (`lib.trust.footage.blurred`).
         shaft: Where the shaft ends in the aligned images, measured from the detected base.
     """
     found: list[Reason] = []

@@ -274,7 +274,7 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
         return teach(recording, seen, **how)
 
     class Kinked(StandIn):
-        networks, closeup_network, tool_network, digest = {}, "some", None, ""
+        networks, closeup_network, digest = {}, "some", ""
 
         def near(self, images, u, *, reach):
             asked.append(u)
@@ -286,6 +286,7 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
         raise RefusalError("training starts")
 
     monkeypatch.setattr(loop, "Detector", Kinked)
+    monkeypatch.setattr(loop, "choose", lambda _, __, seen, *___, **____: seen)
     monkeypatch.setattr(loop, "teach", refusing)
     monkeypatch.setattr(loop, "shaft_axis", lambda *_: np.array([0.8, 0.6, 0.0]) if angled else AHEAD)
     monkeypatch.setattr(loop, "shaft_end", lambda *_: end_at(world, world.u[:, :, 0]) if shown else None)
@@ -748,7 +749,7 @@ def test_a_landmark_that_robot_and_detector_leave_open_asks_for_labels(world, re
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
     class Lost(StandIn):
-        networks, closeup_network, tool_network, stages, near = {}, "some", None, ("frame", "closeup"), Detector.near
+        networks, closeup_network, stages, near = {}, "some", ("frame", "closeup"), Detector.near
         refine = staticmethod(lambda pair, rough, stage, *, reach: Landmarks.none(2))
 
     class ReachedError(Exception):
@@ -761,6 +762,7 @@ def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, m
         raise ReachedError
 
     monkeypatch.setattr(loop, "Detector", Lost)
+    monkeypatch.setattr(loop, "choose", lambda _, __, seen, *___, **____: seen)
     u = np.full(world.u.shape, np.nan)
     u[1:26:3] = world.u[1:26:3]
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")

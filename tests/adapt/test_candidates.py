@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lib.adapt import RefusalError, adapt, loop
-from lib.adapt.candidates import moving_with
+from lib.adapt.candidates import choose, moving_with
 from lib.landmarks.detector import Landmarks
 from tests.adapt.test_adapt import bent
 from tests.adapt.world import SIZE, StandIn, World
@@ -71,7 +71,11 @@ class TakesOthers(StandIn):
 
 @pytest.mark.parametrize("robot", ["right", "bent", "rate"])
 def test_a_detector_that_mostly_takes_other_objects_is_taught_by_a_robot_that_is_right(world, tmp_path, monkeypatch, robot):
-    offs = []
+    offs, chosen = [], []
+
+    def choosing(*arguments, **how):
+        chosen.append(choose(*arguments, **how))
+        return chosen[-1]
 
     def tune(detector, images, *_, **__):
         for one in images:
@@ -80,11 +84,15 @@ def test_a_detector_that_mostly_takes_other_objects_is_taught_by_a_robot_that_is
         raise RefusalError("training starts")
 
     monkeypatch.setattr(loop, "Detector", TakesOthers)
+    monkeypatch.setattr(loop, "choose", choosing)
     monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
     how = {"right": {"clock_s": 0.04}, "bent": {"robot": bent}, "rate": {"rate": 1.15}}[robot]
     record = world.record(tmp_path / "lab", **how)
     found = adapt(record, TakesOthers(world.u, noise_px=0.7), folder=tmp_path / "out", progress=False, tune=tune)
+    assert chosen and not found.improved  # `tune` never trains
     if robot == "right":
         assert "the robot's motion chose" in found.report["notes"][-1] and found.report["reason"] == "training starts"
     if offs:
         assert np.nanmedian(np.linalg.norm(offs, axis=-1)) < 1.5
+    else:
+        assert found.report["reason"].startswith(("detector:", "robot:"))

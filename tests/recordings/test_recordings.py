@@ -160,6 +160,9 @@ def test_short_drops_of_a_fast_log_are_interpolated_and_long_ones_are_not():
     found = kinematics.at(at_s)
     assert np.isnan(found[0, 1]).all() and np.isfinite(found[0, [0, 2]]).all() and np.isnan(found[5]).all()
     np.testing.assert_allclose(found[[1, 2, 3, 4, 6]], at_s[[1, 2, 3, 4, 6], None, None] * np.ones((3, 3)), atol=1e-12)
+    slow_s = np.arange(0, 10, 0.05)
+    slow = Kinematics(slow_s, np.where(np.arange(200) % 4 == 2, np.nan, slow_s)[:, None, None] * np.ones((3, 3)))
+    assert np.isfinite(slow.at(np.arange(0, 9.9, 0.013))).all()  # every gap lasts 0.1 s
     for one, t in zip(found, at_s, strict=True):  # a single time reads a part of the log
         np.testing.assert_array_equal(kinematics.at([t])[0], one)
 

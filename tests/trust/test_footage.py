@@ -93,6 +93,20 @@ def with_eyes(recording, **edits):
     return replace(recording, frames=Frames(eye("left"), eye("right"), frames.time_s))
 
 
+def round_field(image):
+    """The image in a round field of view on black."""
+    height, width = image.shape[:2]
+    return image * cv2.circle(np.zeros((height, width), np.uint8), (width // 2, height // 2), height // 2, 1, -1)[..., None]
+
+
+@pytest.mark.parametrize("sharp", [False, True])
+def test_in_a_round_field_only_what_is_lit_counts(recording, sharp):
+    eyes = with_eyes(recording, left=lambda i, image: round_field(image),
+                     right=lambda i, image: round_field(image if sharp else blurry(image)))  # fmt: skip
+    found = blurred(eyes, np.arange(len(eyes)))
+    assert not found if sharp else ("the right image" in found[0].text)
+
+
 @pytest.mark.parametrize(("side", "edit", "first"), [
     ("right", blurry, 6), ("left", blurry, 0), ("right", scaled_up, 6), ("left", np.zeros_like, 6),
 ])  # fmt: skip
