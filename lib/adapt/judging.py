@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from lib.adapt.teacher import RefusalError, Teacher
-from lib.correspondences import FEWEST_TO_TRAIN
+from lib.correspondences import FEWEST_TO_TRAIN, MIN_CONFIDENCE
 from lib.landmarks.metrics import errors_px, nees, tool_length_px
 from lib.landmarks.recorded import Seen
 from lib.recordings import Recording
@@ -66,6 +66,19 @@ def sd_share(teacher: Teacher, frames: np.ndarray) -> np.ndarray:
     u, covariance = teacher.project(frames)
     sd_px = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2)
     return np.nanmedian(sd_px / tool_length_px(u)[..., None], axis=(0, 1))
+
+
+def base_apart(teacher: Teacher, seen: Seen) -> float:
+    """Median shift along the tool from a teacher's base to the detected one, as a share of the tool's length.
+
+    Detections that are farther than half that length are of other objects.  The result is 0 if fewer than 16 remain.
+    """
+    u = teacher.project(seen.frame)[0]
+    along, off = u[:, :, 1:].mean(axis=2) - u[:, :, 0], (seen.u - u)[:, :, 0]
+    square = (along**2).sum(axis=2)
+    is_tool = ((off**2).sum(axis=2) < 0.25 * square) & (seen.confidence[:, :, 0] >= MIN_CONFIDENCE)
+    shift = ((off * along).sum(axis=2) / square)[is_tool]
+    return float(np.median(shift)) if len(shift) >= _FEWEST else 0.0
 
 
 def frame_means(share: np.ndarray) -> np.ndarray:

@@ -300,6 +300,31 @@ def test_a_detector_that_takes_the_kink_of_angled_jaws_for_the_base_looks_where_
         assert np.degrees(np.abs(np.arctan2(*shaft.T) - np.arctan2(*tips.T))).max() > 10
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.13])
+def test_a_base_that_only_follows_the_robot_teaches_nothing(world, tmp_path, monkeypatch, shift):
+    class Follows(StandIn):
+        networks, closeup_network, digest = {}, "some", ""
+
+        def near(self, images, u, *, reach):
+            found = StandIn(world.u, noise_px=0.7)(images)
+            found.u[:, 0] = u[:, 0]
+            return found
+
+    def longer(_, x_mm):
+        moved = x_mm.copy()
+        moved[:, 0] -= shift * (x_mm[:, 1:].mean(axis=1) - x_mm[:, 0])
+        return moved
+
+    def tune(*_, **__):
+        raise RefusalError("training starts")
+
+    monkeypatch.setattr(loop, "Detector", Follows)
+    monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
+    record = world.record(tmp_path / "lab", robot=longer)
+    found = adapt(record, Follows(world.u, noise_px=0.7), folder=tmp_path / "out", progress=False, tune=tune)
+    assert ("in whole images it sees the base" if shift else "training starts") in found.report["reason"]
+
+
 def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
     """In two thirds of the images the detector takes the elbow of a jaw for its tip: the others tell the offsets."""
     frames, elbows = np.arange(world.n), world.u.copy()
