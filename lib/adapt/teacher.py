@@ -41,9 +41,6 @@ _SURE_MOVE = 0.5
 _BEHIND = 0.1  # least distance from the camera of a visible point, as a share of the working distance
 #: Largest distance of the measured end of the shaft from the label, in standard deviations; a farther one is another edge.
 _ANOTHER_EDGE = 3.0
-#: Error of the base's label along a tool that the detector knows, as a share of its length: 0.004 RMS on twelve recordings,
-#: 0.014 in eleven cases: four others, each with two or three robots that err by 0.2 mm.
-_KNOWN_BASE = 0.01
 #: Prior standard deviations, as shares of the tool's length: of the offset from a detector's point to the labelled one, and
 #: of the shift of an image that errors cause which all landmarks share.
 _OTHER_POINT, _SHARED = 0.3, 0.02
@@ -133,30 +130,25 @@ class Teacher:
         return shown_axes(self.recording.landmarks_mm()[frames], self.calibration.cameras)
 
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
-        """The teacher whose base is moved along the shaft to its measured end; itself if the two disagree.
+        """The teacher whose base is moved along the shaft towards its measured end; itself if the two disagree.
 
-        If the detector knows the tool, its label is better than the end; if not, the label errs as it states.  Both are
-        equally likely beforehand.  The size of the shift changes the odds, which weigh the corrections of the two cases.
-        A detector that does not know the tool marks the base too far back.  So the first case holds if the end lies behind.
+        Label and measurement have the weights of their stated variances.
         """
         if end is None:
             return self
         u, covariance = self.project(end.frame)
         along = end.along / (end.along**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
         shift = np.nanmedian(((end.u - u[:, :, 0]) * along).sum(axis=-1))
-        unknown = np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))
-        variance = np.array([_KNOWN_BASE**2, unknown] if shift > 0 else [_KNOWN_BASE**2])
+        variance = np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))
         total = variance + end.sd**2
-        if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total[-1]):
+        if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total):
             return self
-        gain, odds = variance / total, np.exp(-(shift**2) / (2 * total)) / np.sqrt(total)
-        mean, square = (np.average(value, weights=odds) for value in (gain, gain**2))
         length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
-        offset[0] += mean * shift * length_mm * end.axis
-        variance = (mean * end.sd**2 + (square - mean**2) * shift**2) * length_mm**2
+        offset[0] += variance / total * shift * length_mm * end.axis
+        remaining = variance * end.sd**2 / total * length_mm**2
         own_along = own[0] @ end.axis
-        if (before := own_along @ end.axis) > variance:  # then it falls, as by a measurement
-            own[0] -= (before - variance) / before**2 * np.outer(own_along, own_along)
+        if (before := own_along @ end.axis) > remaining:  # then it falls, as by a measurement
+            own[0] -= (before - remaining) / before**2 * np.outer(own_along, own_along)
         return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

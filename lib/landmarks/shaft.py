@@ -47,10 +47,12 @@ AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the
 _AROUND_PX, _GAP_PX, _BEHIND_PX = 121, 8.0, (38, 71)
 #: Largest angle from the direction of the tips, and factor by which the best energy exceeds the median of all directions.
 _WIDEST_DEG, _SHARP = 64, 3.0
+#: The edge of the end is rounded or bevelled by about a sixth of the radius, more or less.  So the base is nearer to the tips
+#: than the middle of the fitted ellipse, by this share of its half axis along the tool, with this standard deviation.
+_BEVEL, _BEVEL_SD = 0.25, 0.15
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
-#: five recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws: on the
-#: one such tool whose truth is known, the end was measured 0.03 too early.
-_SD, _SD_TAPERED, _SD_PX = 0.011, 0.03, 1.0
+#: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
+_SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
 
 
 class ShaftEnd(NamedTuple):
@@ -171,7 +173,10 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
         outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, _ACROSS_PX[score.argmax()]])
-    sd = float(np.hypot(_SD_TAPERED if _SLOPES[slope] else _SD, _SD_PX / np.nanmedian(size)))
+    steepness = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
+    shown = _RADII_PX[k] * steepness / _LENGTH_PX  # half axis of the ellipse along the tool
+    moved += _BEVEL * shown
+    sd = float(np.linalg.norm([_SD_TAPERED if _SLOPES[slope] else _SD, _SD_PX / np.nanmedian(size), _BEVEL_SD * shown]))
     means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)
     return ShaftEnd(frames, base + moved * along, axis, along, moved, sd, means, np.stack(outlines))
 
