@@ -38,9 +38,9 @@ _END = 0.6  # weight of the half ellipse; the sides have the rest
 _STEEPEST = 0.9  # largest sine; a steeper shaft shows its end from above
 #: A longer outline explains more edges, so the mean score counts times this power of the radius.  A highlight is shorter.
 _LARGE = 0.75
-#: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  It
-#: must exceed the median of all positions by this factor, and its mean score must be this large.
-_AS_CLEAR, _CLEAR, _LEAST = 0.75, 1.45, 0.2
+#: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  The
+#: score of its half ellipse must exceed the median of all positions by this much, and the mean score must be this large.
+_AS_CLEAR, _CLEAR, _LEAST = 0.75, 0.13, 0.2
 AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
 #: Search of the shaft's direction, at half the scale of `_SIZE_PX`: side of the pictures, and the part of them that is used:
 #: its distance behind the base, its width and height.
@@ -148,20 +148,24 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     aligned = _aligned(recording, frames, base, along)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
-    scores, sines = [], []
+    scores, ends, sines = [], [], []
     for side, (pictures, kept) in enumerate(aligned):
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
         even = _even(pictures)
         sines.append(np.array([sine[kept[group], side].mean() for group in groups]))
-        scores.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
+        found = _scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1])
+        scores, ends = [*scores, found[0]], [*ends, found[1]]
     clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
     best = clear.max(axis=(0, 1))
     peaks = np.flatnonzero((best[1:-1] >= best[:-2]) & (best[1:-1] > best[2:])) + 1
     peaks = peaks[best[peaks] > _AS_CLEAR * best.max()]
-    if not len(peaks) or best[peaks[-1]] < _CLEAR * np.median(best):
+    if not len(peaks):
         return None
     i = peaks[-1]
     slope, k = np.unravel_index(clear[:, :, i].argmax(), clear.shape[:2])
+    end = np.mean([score[k].max(axis=0) for score in ends], axis=0)
+    if end[i] < np.median(end) + _CLEAR:
+        return None
     own = [score[slope, k, :, i] for score in scores]  # by the position across
     if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST:
         return None
@@ -225,14 +229,18 @@ def _sides(radius: float, slope: float, sine: np.ndarray) -> tuple[np.ndarray, n
     return points, np.broadcast_to(normal[:, None], (2, _STRAIGHT, 2))
 
 
-def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (slopes, radii, positions across and along)."""
+def _scores(pictures: np.ndarray, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (slopes, radii, positions across and along).
+
+    And how clearly they show its half ellipse alone: (radii, positions across and along).
+    """
     smooth = [cv2.GaussianBlur(picture, (0, 0), 1.2) for picture in pictures]
     gradient = np.stack([[cv2.Sobel(one, cv2.CV_32F, *order) for one in smooth] for order in ((1, 0), (0, 1))])
     level = np.quantile(np.hypot(*gradient).max(axis=-1).reshape(len(pictures), -1), 0.9, axis=1)[:, None]
     found = np.full((len(_SLOPES), len(_RADII_PX), len(_ACROSS_PX), len(_ALONG_PX)), -1.0)  # less than any score
+    ends = found[0].copy()
     if not level.all():  # pictures without any edge
-        return found
+        return found, ends
     g, (w, h), gradient = np.arange(len(pictures))[:, None], _SIZE_PX, gradient.reshape(2, -1, 3)
 
     def clear(points: np.ndarray, normal: np.ndarray, across: float) -> np.ndarray:
@@ -246,12 +254,12 @@ def _scores(pictures: np.ndarray, sine: np.ndarray) -> np.ndarray:
 
     for i, radius in enumerate(_RADII_PX):
         for j, across in enumerate(_ACROSS_PX):
-            end = clear(*_half_ellipse(radius, sine), across)
+            ends[i, j] = clear(*_half_ellipse(radius, sine), across)
             for k, slope in enumerate(_SLOPES if across == 0 else _SLOPES[:1]):
                 sides, normal = _sides(radius, slope, sine)
                 lines = clear(sides.reshape(len(sine), -1, 2), normal.reshape(-1, 2), across)
-                found[k, i, j] = _END * end + (1 - _END) * lines
-    return found
+                found[k, i, j] = _END * ends[i, j] + (1 - _END) * lines
+    return found, ends
 
 
 def outlined(end: ShaftEnd, zoom: int = 3) -> np.ndarray:
