@@ -32,6 +32,9 @@ _CONTRADICTED = 0.2
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
 #: standard deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm even for short tools.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
+#: Distance of the tips across the tool, as a share of its length, with and without offsets, that shows the tool's roll: at
+#: half of it, the robot's error of a few hundredths of a mm turned the axes by up to 80 degrees.
+_OPEN = 0.12
 #: Relative error of an offset if the tool's axes of shut jaws are taken from a time farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
 _TURNS_S = 0.02  # between the samples of the log from which axes are taken; shorter steps are not worth their time
@@ -104,7 +107,7 @@ class Teacher:
                     when_s = np.append(log_s[log], at[:, 0])  # shut jaws take their axes from other samples of the log
                     order = np.argsort(when_s)
                     path = np.concatenate([r.kinematics.x_mm[log], x])[order]
-                    known = tool_axes(path, offset if self.turns else None)
+                    known = _sure_axes(path, tool_axes(path, offset if self.turns else None), offset)
                     axes = np.nan_to_num(carried(known, path, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
                     apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
                     shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
@@ -264,6 +267,15 @@ def _length_mm(recording: Recording) -> float:
     """Median length of the tool, from its base to the middle of its tips."""
     x = recording.landmarks_mm()
     return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
+
+
+def _sure_axes(x_mm: np.ndarray, axes: np.ndarray, offset_mm: np.ndarray) -> np.ndarray:
+    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3); NaN where the tips are too close to show the roll, unless all are."""
+    reported = np.einsum("nji,nj->ni", axes, x_mm[:, 2] - x_mm[:, 1])
+    length = np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=1)
+    apart = [np.linalg.norm(one[:, 1:], axis=1) for one in (reported, reported + offset_mm[2] - offset_mm[1])]
+    is_open = np.minimum(*apart) > _OPEN * length
+    return np.where(is_open[:, None, None], axes, np.nan) if is_open.any() else axes
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:

@@ -22,7 +22,7 @@ from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.recorded import Seen, look
 from lib.landmarks.shaft import AHEAD, ShaftEnd
-from lib.recordings import Kinematics, Scene
+from lib.recordings import Frames, Kinematics, Scene
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.adapt.world import SIZE, Kept, StandIn, World, pupil
@@ -323,6 +323,28 @@ def test_a_base_that_only_follows_the_robot_teaches_nothing(world, tmp_path, mon
     record = world.record(tmp_path / "lab", robot=longer)
     found = adapt(record, Follows(world.u, noise_px=0.7), folder=tmp_path / "out", progress=False, tune=tune)
     assert ("in whole images it sees the base" if shift else "training starts") in found.report["reason"]
+
+
+def test_jaws_that_are_nearly_shut_keep_their_roll(world, recording, monkeypatch):
+    """Robot and teacher disagree on the tips by 0.06 mm, which turns the axes of nearly shut jaws by far."""
+    time_s = np.arange(0, 12, 0.02)
+    opening = np.interp(time_s, [0, 4, 6, 10, 12], [0.6, 0.6, 0.04, 0.04, 0.6])[:, None] / 2
+    place = world.at(np.zeros(1))[0, :1] + 0.1 * time_s[:, None] * [1.0, 0.3, -0.2]
+    tips = ([2.5, 0, 0] + side * opening * [0, 1, 0] for side in (-1, 1))
+    true = place[:, None] + np.stack([0 * place, *tips], axis=1)
+    offset_mm = np.array([[0.0, 0.0, 0.2], [0.0, -0.1, 0.0], [0.0, 0.06, 0.0]])
+    reported = true - offset_mm - np.array([[0, 0, 0], [0, 0, -0.03], [0, 0, 0.03]])
+    frames = Frames(None, None, time_s[::25])
+    lab = replace(recording, kinematics=Kinematics(time_s, reported), frames=frames, offset_s=0.0)
+    known = replace(taught(recording, StandIn(world.u, noise_px=0.7)), recording=lab, offset_mm=offset_mm, turns=True)
+    shown = np.stack([camera.project(true[::25].reshape(-1, 3)).reshape(-1, 3, 2) for camera in known.calibration.cameras], 1)
+
+    def error_px():
+        return np.linalg.norm(known.project(np.arange(len(frames)))[0] - shown, axis=-1)[13:20].max()
+
+    kept = error_px()
+    monkeypatch.setattr(teacher, "_OPEN", 0.0)
+    assert kept < 1.5 < error_px()
 
 
 def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
