@@ -141,6 +141,7 @@ class _Work:
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
         self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
+        self.whole: Seen  # the detections that taught first, without the robot's report
         self.shaft: ShaftEnd | None = None
         self.axis: np.ndarray | None = None  # of the shaft, in the tool's axes
         self.knows_base = True  # False: the detector marks another point for the base
@@ -263,7 +264,8 @@ class _Work:
                 what = f"{LANDMARKS[sd.argmax()]} only to {100 * sd.max():.0f} % of the tool's length (standard deviation)"
                 raise RefusalError(f"detector: with the robot it gives {what}. {LABEL}")
             # A detector that looks near the robot's base may follow the robot, whatever is there.
-            if self.knows_base and abs(apart := base_apart(teacher, seen)) > _APART:
+            whole = self.whole.of(np.setdiff1d(learn, teacher.refused))
+            if self.looks_near and self.knows_base and abs(apart := base_apart(teacher, whole)) > _APART:
                 what = f"in whole images it sees the base {100 * abs(apart):.0f} % of the tool's length from where it sees it"
                 what += " near the robot's report. It marks another point there, or the robot's tool has other dimensions"
                 raise RefusalError(f"detector: {what}. {LABEL}")
@@ -307,12 +309,13 @@ class _Work:
 
     def taught(self, seen: Seen, by_hand: Seen | None) -> Teacher:
         """The first teacher, by the detections or, if they do not teach, by those candidates that move with the robot."""
+        self.whole = seen
         try:
             return self.with_any_base(seen, by_hand)
         except RefusalError as refused:
             if by_hand is not None or not self.looks_near:
                 raise
-            chosen = self.kept("chosen", partial(choose, self.recording, self.detector, seen, self.seed))
+            self.whole = chosen = self.kept("chosen", partial(choose, self.recording, self.detector, seen, self.seed))
             self.axis = None  # it may rest on wrong cameras
             try:
                 teacher = self.with_any_base(chosen.labelled(self.labels), None, name="base of the chosen")

@@ -32,9 +32,9 @@ _CONTRADICTED = 0.2
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
 #: standard deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm even for short tools.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
-#: Distance of the tips across the tool, as a share of its length, with and without offsets, that shows the tool's roll: at
-#: half of it, the robot's error of a few hundredths of a mm turned the axes by up to 80 degrees.
-_OPEN = 0.12
+#: Distance of the tips across the tool, with and without offsets, that shows its roll: a share of the tool's length, or
+#: a multiple of its standard deviation.  And the least share of the log in which the jaws are so far open.
+_OPEN, _OPEN_SDS, _OPEN_SHARE = 0.12, 8.0, 0.2
 #: Relative error of an offset if the tool's axes of shut jaws are taken from a time farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
 _TURNS_S = 0.02  # between the samples of the log from which axes are taken; shorter steps are not worth their time
@@ -107,7 +107,7 @@ class Teacher:
                     when_s = np.append(log_s[log], at[:, 0])  # shut jaws take their axes from other samples of the log
                     order = np.argsort(when_s)
                     path = np.concatenate([r.kinematics.x_mm[log], x])[order]
-                    known = _sure_axes(path, tool_axes(path, offset if self.turns else None), offset)
+                    known = self._sure_axes(path, tool_axes(path, offset if self.turns else None))
                     axes = np.nan_to_num(carried(known, path, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
                     apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
                     shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
@@ -127,6 +127,15 @@ class Teacher:
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
         return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
+
+    def _sure_axes(self, x_mm: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """The axes (n, 3, 3) of tools at x_mm (n, 3, 3); NaN where tips too close to each other do not show the roll."""
+        reported = np.einsum("nji,nj->ni", axes, x_mm[:, 2] - x_mm[:, 1])
+        told = reported, reported + self.offset_mm[2] - self.offset_mm[1]
+        sd_mm = np.sqrt(np.trace(self.offset_covariance_mm2[1:, 1:, 1:].sum(axis=0)) / 2)
+        limit_mm = np.minimum(_OPEN * np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=1), _OPEN_SDS * sd_mm)
+        is_open = np.minimum(*(np.linalg.norm(apart[:, 1:], axis=1) for apart in told)) > limit_mm
+        return np.where(is_open[:, None, None], axes, np.nan) if is_open.mean() > _OPEN_SHARE else axes
 
     def axes_px(self, frames: np.ndarray) -> np.ndarray:
         """The images (m, 2, 2, 3) px of the tool's axes in some frames, each axis as long as the tool."""
@@ -267,15 +276,6 @@ def _length_mm(recording: Recording) -> float:
     """Median length of the tool, from its base to the middle of its tips."""
     x = recording.landmarks_mm()
     return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
-
-
-def _sure_axes(x_mm: np.ndarray, axes: np.ndarray, offset_mm: np.ndarray) -> np.ndarray:
-    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3); NaN where the tips are too close to show the roll, unless all are."""
-    reported = np.einsum("nji,nj->ni", axes, x_mm[:, 2] - x_mm[:, 1])
-    length = np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=1)
-    apart = [np.linalg.norm(one[:, 1:], axis=1) for one in (reported, reported + offset_mm[2] - offset_mm[1])]
-    is_open = np.minimum(*apart) > _OPEN * length
-    return np.where(is_open[:, None, None], axes, np.nan) if is_open.any() else axes
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:

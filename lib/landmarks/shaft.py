@@ -1,7 +1,7 @@
 """Where the shaft ends, in images that the robot aligns.
 
-The base has no edge of its own, so a detector that does not know a tool marks it too far along the shaft, in all frames by
-the same distance.  But the base is where the jaws leave the shaft, on its axis, and that can be measured.  The robot's
+The base has no edge of its own, so a detector that does not know a tool marks it elsewhere on the shaft, in all frames by the
+same distance.  But the base is where the jaws leave the shaft, on its axis, and that can be measured.  The robot's
 landmarks align the frames; in their mean the tool stays and the ground fades.  The shaft is a cylinder that ends flat.  Its
 end appears as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between
 shaft and image.  So the outline is two lines, parallel or tapered, and the half of the ellipse on the side of the tips.
@@ -48,8 +48,9 @@ _AROUND_PX, _GAP_PX, _BEHIND_PX = 121, 8.0, (38, 71)
 #: Largest angle from the direction of the tips, and factor by which the best energy exceeds the median of all directions.
 _WIDEST_DEG, _SHARP = 64, 3.0
 #: The edge of the end is rounded or bevelled by about a sixth of the radius, more or less.  So the base is nearer to the tips
-#: than the middle of the fitted ellipse, by this share of its half axis along the tool, with this standard deviation.
-_BEVEL, _BEVEL_SD = 0.25, 0.15
+#: than the middle of the fitted ellipse, by this share of its half axis along the tool, with this standard deviation.  A wide
+#: shaft that is seen steeply does not show the base: there that is more than the third number, in tool lengths.
+_BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
@@ -179,6 +180,8 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
         outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, _ACROSS_PX[score.argmax()]])
     steepness = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
     shown = _RADII_PX[k] * steepness / _LENGTH_PX  # half axis of the ellipse along the tool
+    if _BEVEL * shown > _LARGEST_BEVEL:
+        return None
     moved += _BEVEL * shown
     sd = float(np.linalg.norm([_SD_TAPERED if _SLOPES[slope] else _SD, _SD_PX / np.nanmedian(size), _BEVEL_SD * shown]))
     means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)

@@ -43,7 +43,7 @@ def blurred(recording: Recording, frames: np.ndarray) -> list[Doubt]:
     """The doubt that images of one eye lack the fine detail that the other eye's show, in some of the given frames."""
     frames = frames[spread(len(frames), _COMPARED)]
     pairs = (recording.frames[int(i)] for i in frames)
-    left, right = np.array([[_detail(pair.left), _detail(pair.right)] for pair in pairs]).swapaxes(0, 1)
+    left, right = np.array([_details(pair.left, pair.right) for pair in pairs]).swapaxes(0, 1)
     for side, own, other in (("left", left, right), ("right", right, left)):
         found = (own < _BLURRED * other).any(axis=1)
         if found.mean() > _OFTEN:
@@ -54,16 +54,15 @@ def blurred(recording: Recording, frames: np.ndarray) -> list[Doubt]:
     return []
 
 
-def _detail(image: np.ndarray) -> np.ndarray:
-    """(3,) contrasts of details of 2, 4 and 8 px relative to that of 16 px, 0 in a blank image.  Single pixels are noise.
+def _details(left: np.ndarray, right: np.ndarray) -> list[np.ndarray]:
+    """`_detail` of two images, in the box around what either shows lit: a round field has a dark surround."""
+    x, y, width, height = cv2.boundingRect((~dark_mask(left) | ~dark_mask(right)).view(np.uint8))
+    return [_detail(image[y : y + height, x : x + width]) if width else np.zeros(_SIZES) for image in (left, right)]
 
-    What is dark around a round field does not count.
-    """
-    x, y, width, height = cv2.boundingRect((~dark_mask(image)).view(np.uint8))
-    if not width:
-        return np.zeros(_SIZES)
-    field = np.ascontiguousarray(image[y : y + height, x : x + width])
-    grey = [np.log(cv2.cvtColor(field, cv2.COLOR_RGB2GRAY) + np.float32(8))]
+
+def _detail(image: np.ndarray) -> np.ndarray:
+    """(3,) contrasts of details of 2, 4 and 8 px relative to that of 16 px, 0 in a blank image.  Single pixels are noise."""
+    grey = [np.log(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) + np.float32(8))]
     for _ in range(_SIZES + 2):
         grey.append(cv2.pyrDown(grey[-1]))
     *sizes, coarse = (np.median(np.abs(a - cv2.pyrUp(b, dstsize=a.shape[::-1]))) for a, b in pairwise(grey[1:]))

@@ -45,13 +45,17 @@ class TakesOthers(StandIn):
     """Takes another object for the tool in most images, but the tool is among its candidates."""
 
     networks, closeup_network, tool_network, digest = {}, "some", "some", ""
+    same_shaft = False
 
     def __call__(self, images):
         found = super().__call__(images)
         for j, image in enumerate(images):
             rng = np.random.default_rng([7, *image[0, 0]])
             if rng.random() < 0.97:
+                base, *tips = found.u[j]
+                near = base + rng.uniform(0.2, 0.45) * (np.mean(tips, axis=0) - base)
                 found.u[j] += rng.uniform(-1, 1, 2) * SIZE
+                found.u[j, 0] = near if self.same_shaft else found.u[j, 0]
         return found
 
     def coarse(self, images):
@@ -69,8 +73,10 @@ class TakesOthers(StandIn):
         return Landmarks(found.u, found.covariance, np.where(known & ~away, found.confidence, 0.0)).without_unsure()
 
 
-@pytest.mark.parametrize("robot", ["right", "bent", "rate"])
-def test_a_detector_that_mostly_takes_other_objects_is_taught_by_a_robot_that_is_right(world, tmp_path, monkeypatch, robot):
+@pytest.mark.parametrize(("robot", "same_shaft"), [("right", False), ("right", True), ("bent", False), ("rate", False)])
+def test_a_detector_that_mostly_takes_other_objects_is_taught_by_a_robot_that_is_right(
+    world, tmp_path, monkeypatch, robot, same_shaft
+):
     offs, chosen = [], []
 
     def choosing(*arguments, **how):
@@ -84,6 +90,7 @@ def test_a_detector_that_mostly_takes_other_objects_is_taught_by_a_robot_that_is
         raise RefusalError("training starts")
 
     monkeypatch.setattr(loop, "Detector", TakesOthers)
+    monkeypatch.setattr(TakesOthers, "same_shaft", same_shaft)
     monkeypatch.setattr(loop, "choose", choosing)
     monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
     how = {"right": {"clock_s": 0.04}, "bent": {"robot": bent}, "rate": {"rate": 1.15}}[robot]

@@ -131,6 +131,17 @@ def test_pictures_that_show_no_end_of_a_shaft_give_none(left_out):
     assert shaft_end(recording, frames, u[frames, :, 0], shown(u[frames], 0.4)) is None
 
 
+def test_a_shaft_that_ends_outside_the_pictures_or_is_thick_and_steep_gives_none(monkeypatch):
+    u = tools(0.4)
+    far = u[:, :, 0] - 0.4 * (u[:, :, 1:].mean(axis=2) - u[:, :, 0])
+    outside = pictured(u, 0.4, jaws=False), FRAMES, far, shown(u, 0.4)
+    steep = pictured(tools(0.75), 0.75, radius_px=24.0), FRAMES, tools(0.75)[:, :, 0], shown(tools(0.75), 0.75)
+    assert shaft_end(*outside) is None and shaft_end(*steep) is None
+    monkeypatch.setattr(shaft, "_CLEAR", -10.0)
+    monkeypatch.setattr(shaft, "_LARGEST_BEVEL", 1.0)
+    assert shaft_end(*outside) is not None and shaft_end(*steep) is not None
+
+
 def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edge(tmp_path):
     world = World()
     frames = np.arange(world.n)

@@ -93,6 +93,13 @@ def with_eyes(recording, **edits):
     return replace(recording, frames=Frames(eye("left"), eye("right"), frames.time_s))
 
 
+def covered(image):
+    """The image with two thirds of it behind something black."""
+    image = image.copy()
+    image[:, image.shape[1] // 3 :] = 0
+    return image
+
+
 def round_field(image):
     """The image in a round field of view on black."""
     height, width = image.shape[:2]
@@ -108,7 +115,7 @@ def test_in_a_round_field_only_what_is_lit_counts(recording, sharp):
 
 
 @pytest.mark.parametrize(("side", "edit", "first"), [
-    ("right", blurry, 6), ("left", blurry, 0), ("right", scaled_up, 6), ("left", np.zeros_like, 6),
+    ("right", blurry, 6), ("left", blurry, 0), ("right", scaled_up, 6), ("left", np.zeros_like, 6), ("right", covered, 0),
 ])  # fmt: skip
 def test_an_eye_that_is_blurred_is_told(recording, side, edit, first):
     spoilt = with_eyes(recording, **{side: lambda i, image: edit(image) if i >= first else image})
