@@ -32,8 +32,8 @@ _CONTRADICTED = 0.2
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
 #: standard deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm even for short tools.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
-#: Distance of the tips across the tool, with and without offsets, that shows its roll: a share of the tool's length, or
-#: a multiple of its standard deviation.  And the least share of the log in which the jaws are so far open.
+#: Distance of the tips across the tool, with and without offsets, that shows its roll: a share of the tool's length, or a
+#: multiple of the standard deviation, whichever is smaller.  And the least share of the log in which jaws are so far open.
 _OPEN, _OPEN_SDS, _OPEN_SHARE = 0.12, 8.0, 0.2
 #: Relative error of an offset if the tool's axes of shut jaws are taken from a time farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1

@@ -149,13 +149,13 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     aligned = _aligned(recording, frames, base, along)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
-    scores, ends, sines = [], [], []
+    found, sines = [], []
     for side, (pictures, kept) in enumerate(aligned):
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
         even = _even(pictures)
         sines.append(np.array([sine[kept[group], side].mean() for group in groups]))
-        found = _scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1])
-        scores, ends = [*scores, found[0]], [*ends, found[1]]
+        found.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
+    scores, ends = zip(*found, strict=True)
     clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
     best = clear.max(axis=(0, 1))
     peaks = np.flatnonzero((best[1:-1] >= best[:-2]) & (best[1:-1] > best[2:])) + 1
@@ -168,7 +168,9 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     if end[i] < np.median(end) + _CLEAR:
         return None
     own = [score[slope, k, :, i] for score in scores]  # by the position across
-    if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST:
+    tangent = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
+    shown = _RADII_PX[k] * tangent / _LENGTH_PX  # half axis of the ellipse along the tool, in tool lengths
+    if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST or _BEVEL * shown > _LARGEST_BEVEL:
         return None
     before, at, after = best[i - 1 : i + 2]
     moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
@@ -178,10 +180,6 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
         outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, _ACROSS_PX[score.argmax()]])
-    steepness = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
-    shown = _RADII_PX[k] * steepness / _LENGTH_PX  # half axis of the ellipse along the tool
-    if _BEVEL * shown > _LARGEST_BEVEL:
-        return None
     moved += _BEVEL * shown
     sd = float(np.linalg.norm([_SD_TAPERED if _SLOPES[slope] else _SD, _SD_PX / np.nanmedian(size), _BEVEL_SD * shown]))
     means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)
@@ -233,9 +231,9 @@ def _sides(radius: float, slope: float, sine: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _scores(pictures: np.ndarray, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end: (slopes, radii, positions across and along).
+    """How clearly pictures (g, h, w, 3) show the outline of a shaft's end.
 
-    And how clearly they show its half ellipse alone: (radii, positions across and along).
+    Of the whole outline (slopes, radii, positions across, positions along), and of its half ellipse alone (without slopes).
     """
     smooth = [cv2.GaussianBlur(picture, (0, 0), 1.2) for picture in pictures]
     gradient = np.stack([[cv2.Sobel(one, cv2.CV_32F, *order) for one in smooth] for order in ((1, 0), (0, 1))])
