@@ -127,7 +127,7 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
     try:
         found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
-        said = {doubt.name: f"{doubt.text} {doubt.cure}" for doubt in draft.doubts if doubt.name != "jump"}
+        said = {doubt.name: f"{doubt.text} {doubt.cure}" for doubt in draft.doubts if doubt.is_of_time}
         wrong = said.pop("little_overlap", None)  # at the offset where the search began, so that it had to find another
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError) and not wrong:
             return str(error).removesuffix(".")

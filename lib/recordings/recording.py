@@ -45,6 +45,7 @@ _HELD_S, _FEWEST_NEW, _STEPS = 0.015, 10, 3.0
 #: Rows that a buffer delivers together: bursts take less than the first share of the time, and pauses between them are at
 #: most this long, in s; longer ones may be breaks in the work.
 _BURST_SHARE, _LONGEST_PAUSE_S = 0.1, 1.0
+_SHORTEST_MM = 0.8  # least plausible distance of the tips from the base; the jaws of most forceps are 2 to 6 mm long
 _SLOW_S = 0.15  # largest plausible median step between samples; robots report 10 to 1000 times a second
 
 
@@ -54,6 +55,11 @@ class Doubt(NamedTuple):
     name: str
     text: str
     cure: str
+
+    @property
+    def is_of_time(self) -> bool:
+        """False if the doubt is about positions or images."""
+        return self.name not in ("jump", "units", "blurred")
 
 
 def _kinematics_columns(landmarks: Sequence[str]) -> list[str]:
@@ -209,6 +215,7 @@ class Recording:
         videos = [] if own_times else self.folder.glob("*.mp4")
         stated = [video_times(path) for path in videos if path.stem in SIDES]
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
+        reach_mm = float(np.nanmedian(np.linalg.norm(self.kinematics.x_mm[:, 1:] - self.kinematics.x_mm[:, :1], axis=2)))
         longer = not own_times and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
@@ -229,13 +236,15 @@ class Recording:
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
+            (reach_mm < _SHORTEST_MM, "units", f"The robot reports the tips only {reach_mm:.2g} mm from the base.",
+             "Is kinematics.csv in mm? If it is in cm, multiply its positions by 10: all results in mm depend on it."),
         )  # fmt: skip
         return [Doubt(*doubt) for holds, *doubt in cases if holds]
 
     @property
     def mistimed(self) -> str:
         """Doubts about times, with their cures, or "".  If no calibration is found, correct these first."""
-        return " ".join(f"{doubt.text} {doubt.cure}" for doubt in self.doubts if doubt.name != "jump")  # that is in space
+        return " ".join(f"{doubt.text} {doubt.cure}" for doubt in self.doubts if doubt.is_of_time)
 
     def frames_of(self, text: str) -> range:
         """The frames of --frames "A:B": from A to before B, negative numbers from the end; a ValueError if there are none."""

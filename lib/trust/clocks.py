@@ -15,7 +15,8 @@ from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, 
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
 _ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search: most rows, and most trial shifts on each side of 0
 _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras do not fit or the best shift is at the edge
-_WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too
+_WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too; and
+# by a clock that jumps over one that does not
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
@@ -38,7 +39,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         ("clock", (0, 1), misfit.sum(axis=1)), ("camera_clock", (0,), misfit[:, 0] + misfit[now, 1]),
         ("camera_clock", (1,), misfit[:, 1] + misfit[now, 0]),
     ):  # fmt: skip
-        if (fitted := _refined(case, float(trial[np.argmin(score)]), views)) is None:
+        if (fitted := _refined(case, trial[[np.argmin(score)]], np.ones((1, len(case.problem))), views)) is None:
             continue
         fit, problem, (value,), (sd,) = fitted
         size = f"{1e3 * value:z.1f} +- {1e3 * sd:.1f} ms"
@@ -53,20 +54,18 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
 
 
 def _refined(
-    case: Case, shift: float, views: tuple[int, ...], rate: float | None = None
+    case: Case, value: np.ndarray, columns: np.ndarray, views: tuple[int, ...] = (0, 1)
 ) -> tuple[Robust, Problem, np.ndarray, np.ndarray] | None:
-    """Refine the clock's shift (and rate - 1) by Gauss-Newton: the fit, its rows, the values, their standard deviations."""
-    time = case.problem.time - np.median(case.problem.time)
-    powers = np.ones((1, len(time))) if rate is None else np.stack([np.ones(len(time)), time])
-    value, start = np.array([shift] if rate is None else [shift, rate - 1.0]), None
+    """Refine the clock's shift, value (k,) @ columns (k, n) s, by Gauss-Newton: the fit, its rows, the values, their sds."""
+    start = None
     for _ in range(6):
-        later = value @ powers
+        later = value @ columns
         velocity = case.velocity(later)
         problem = case.problem.moved_to(np.where(np.isfinite(velocity), case.moved(later), np.nan), views)
         if problem.used.all(axis=1).sum() < 6:
             return None
         v = velocity[:, None] * np.isin((0, 1), views)[:, None]
-        fit = problem.fit(lambda M, v=v: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=start)
+        fit = problem.fit(lambda M, v=v: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, columns), start=start)
         start, sd = fit.start, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
@@ -74,14 +73,16 @@ def _refined(
     return fit, problem, value, sd
 
 
-def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Trial shifts (t,) s of the clock, and the misfit (t, 2) of each camera on its own."""
+def _scan(
+    case: Case, half_s: float, rate: float = 1.0, moves: np.ndarray | bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Trial shifts (t,) s of the clock, of all rows or those that `moves`, and the misfit (t, 2) of each camera alone."""
     problem = case.problem
     trial = np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, np.clip(half_s / 0.05, 60, _MOST_TRIALS))) + 1)
     chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
     later = (rate - 1.0) * (problem.time - np.median(problem.time))
     y = np.where(problem.used[:, :, None], problem.y, np.nan)[chosen].reshape(-1, 4)
-    return trial, shift_misfits(case.moved(trial[:, None] + later)[:, chosen], y)
+    return trial, shift_misfits(case.moved(trial[:, None] * moves + later)[:, chosen], y)
 
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
@@ -93,7 +94,8 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
         rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
         trial, misfit = scans[rate]
         shift = float(trial[misfit.sum(axis=1).argmin()])
-    if (fitted := _refined(case, shift, (0, 1), rate)) is None:
+    time = case.problem.time - np.median(case.problem.time)
+    if (fitted := _refined(case, np.array([shift, rate - 1.0]), np.stack([np.ones(len(time)), time]))) is None:
         return
     fit, problem, (shift, value), (shift_sd, sd) = fitted
     if abs(value) > _FAR_OFF and case.misfit(fit) >= FITS:  # by chance, part of a path passes near some frames
@@ -109,6 +111,53 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
         if abs(shift) > 5.0 * np.hypot(shift_sd, sd * np.median(case.problem.time)):
             cure += f" Add {shift:.4f} to offset_s as well."
         yield case.found("clock_rate", fit, 4, (1 + value, sd, "times"), text, cure, on=problem)
+
+
+def _clock_jump(case: Case) -> Iterator[Hypothesis]:
+    """A clock that jumps, or frames that were lost: from one frame on, the images show the tool at other instants."""
+    problem = case.problem
+    if case.frames < 8:
+        return
+    cut = _cut(_by_frame(case, _losses(case, case.null, problem.x[:, 0])))
+    trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s), moves=problem.frame >= cut)
+    value = np.array([0.0, trial[misfit.sum(axis=1).argmin()]])  # the clock's shift before the cut, and the jump
+    for _ in range(3):
+        late = problem.frame >= cut
+        if (fitted := _refined(case, value, np.stack([np.ones(len(late)), late]))) is None:
+            return
+        fit, moved, value, sd = fitted
+        before, after = (_losses(case, fit, case.moved(shift)) for shift in np.cumsum(value))
+        last, cut = cut, int(np.cumsum(_by_frame(case, before - after)[::-1])[::-1][2:-2].argmax()) + 2
+        if cut == last:
+            break
+    steady = max((case.fits[name].total for name in ("clock", "clock_rate") if name in case.fits), default=-np.inf)
+    if abs(value[1]) > 5.0 * sd[1] and fit.total > steady + _WORTH:
+        number, size = problem.number[cut], f"{1e3 * abs(value[1]):.1f} +- {1e3 * sd[1]:.1f} ms"
+        text = f"From frame {number} on, the images show the tool {size} {'later' if value[1] > 0 else 'earlier'}."
+        cure = f"Look for lost ones there, or did a clock jump? Add {value[1]:.4f} s to the times from frame {number} on, "
+        cure += "in frames.csv (frame, time_s)."
+        if abs(value[0]) > 5.0 * sd[0]:
+            cure += f" Add {value[0]:.4f} to offset_s as well."
+        yield case.found("frame_order", fit, 5, (1e3 * value[1], 1e3 * sd[1], "ms"), text, cure, on=moved)
+
+
+def _losses(case: Case, fit: Robust, x: np.ndarray) -> np.ndarray:
+    """(n,) robust losses of a fit with the landmarks at positions x (n, 3), NaN where these are unknown."""
+    r2 = (case.problem.missed(fit, np.repeat(x[:, None], 2, axis=1)) ** 2).sum(axis=2) / fit.shapes[0].scale ** 2
+    return np.where(case.problem.seen, np.log1p(r2), 0.0).sum(axis=1)
+
+
+def _by_frame(case: Case, losses: np.ndarray) -> np.ndarray:
+    """(frames,) sums of the known losses (n,)."""
+    return np.bincount(case.problem.frame, np.nan_to_num(losses), case.frames)
+
+
+def _cut(score: np.ndarray) -> int:
+    """The frame, not one of the first or last two, before and after which the means of a score differ most."""
+    before = np.arange(2, len(score) - 2)
+    total = np.cumsum(score)[before - 1]
+    apart = total / before - (score.sum() - total) / (len(score) - before)
+    return int(before[np.argmax(apart**2 * before * (len(score) - before))])
 
 
 def _frame_order(case: Case) -> Iterator[Hypothesis]:
@@ -253,4 +302,6 @@ def log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s
 
 
 #: Tests that need the tool's path over time (`Case.paths`).
-TIME_TESTS = (_clock, _clock_rate, _frame_order, _sorted_as_text, _time_stamps, _smoothed_log, _backlash, _readout)
+TIME_TESTS = (
+    _clock, _clock_rate, _clock_jump, _frame_order, _sorted_as_text, _time_stamps, _smoothed_log, _backlash, _readout,
+)  # fmt: skip

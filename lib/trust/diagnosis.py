@@ -35,6 +35,7 @@ _UNFIT_SHARE = 0.2  # least share of gross errors in the landmarks of an unfit d
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
+_ALIKE_REST = 2.0  # a clock's offset only competes with its rate if it leaves less than this multiple of the rate's residuals
 _MOSTLY = 0.5  # share of the residuals, above which a cause explains most of them
 _UNITS = (1e3, 1e-3, 1e2, 1e-2, 1e1, 1e-1)  # ratios of units of length that are tried
 _ALIKE, _RIGID = 5.0, 0.1  # landmarks of a tool move as far within this factor, and stay apart within this share of it
@@ -269,7 +270,8 @@ def _prefer_simple(found: list[Hypothesis]) -> list[Hypothesis]:
     causes = [h for h in found if h.is_named]
     for name, rivals in (("robot_noise", {h.name for h in causes} - {"robot_noise"}), ("clock_rate", {"clock"})):
         own = max((h.explained for h in causes if h.name == name), default=0.0)
-        most = max((h.gain for h in causes if h.name in rivals and h.explained > own - _NEARLY), default=np.inf)
+        least = own - _NEARLY if name == "robot_noise" else max(own - _NEARLY, 1.0 - _ALIKE_REST * (1.0 - own))
+        most = max((h.gain for h in causes if h.name in rivals and h.explained > least), default=np.inf)
         found = [replace(h, gain=min(h.gain, 0.9 * most)) if h.name == name else h for h in found]
     return found
 

@@ -26,7 +26,7 @@ _COMPARED, _SIZES, _ROUNDED, _BLANK = 12, 3, 1e-3, 1e-4
 #: Largest share of the other image's detail that an image in doubt shows, and least share of such frames.  In 30 good
 #: recordings, of which some have unlike cameras, the lower of both shares was 0.77 or more.
 _BLURRED, _OFTEN = 0.6, 0.2
-_UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.1)  # units to which times and positions may be rounded
+_UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.5, 0.2, 0.1, 0.05)  # units to which times and positions may be rounded
 
 
 def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:

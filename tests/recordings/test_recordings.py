@@ -708,7 +708,7 @@ def test_frames_are_named_as_slices_are(text, frames):
     (40, np.arange(-0.1, 2, 0.01), 0.0, None),
 ])  # fmt: skip
 def test_doubts(frames, times, jump, name, tmp_path):
-    log = Kinematics(times, np.zeros((len(times), 3, 3)))
+    log = Kinematics(times, np.repeat(tool(1), len(times), axis=0))
     log.x_mm[2] += jump
     at = Frames(None, None, np.arange(frames) / 25)
     shipped = Recording.open(paths.SHIPPED_RECORDING)
@@ -719,12 +719,20 @@ def test_doubts(frames, times, jump, name, tmp_path):
     assert [doubt.name for doubt in replace(recording).doubts] == ([name] if name not in (None, "frame_times") else [])
 
 
+def test_a_log_in_centimetres_is_in_doubt():
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    log = Kinematics(recording.kinematics.time_s, 0.1 * recording.kinematics.x_mm)
+    recording = replace(recording, kinematics=log)
+    assert [doubt.name for doubt in recording.doubts] == ["units"] and "cm" in recording.doubts[0].cure
+    assert not recording.mistimed
+
+
 @pytest.mark.parametrize("named", [False, True])
 def test_cells_that_are_left_blank_where_the_robot_was_silent_are_no_doubt(named):
     """The cure of a log that stood still for a while; samples that are missing are doubted."""
     times = np.arange(-0.1, 2, 0.01)
     silent = (times > 0.4) & (times < 1.2)
-    log = Kinematics(times, np.where(silent[:, None, None], np.nan, np.zeros((len(times), 3, 3))))
+    log = Kinematics(times, np.where(silent[:, None, None], np.nan, tool(1)))
     log = Kinematics(times[~silent], log.x_mm[~silent]) if named else log
     at = Frames(None, None, np.arange(40) / 25)
     recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
@@ -751,7 +759,8 @@ def test_a_log_whose_times_come_in_bursts_is_in_doubt(burst_s, pause_s, named, t
     """Rows that a buffer delivers together; a log with breaks, or that states a part of the motion, is as it should be."""
     starts = np.arange(-2.0 * pause_s, 12 * pause_s + 4, pause_s)
     times = (starts[:, None] + np.linspace(0, burst_s, 20)).ravel()
-    log, at = Kinematics(times, np.zeros((len(times), 3, 3))), Frames(None, None, np.arange(int(250 * pause_s)) / 25)
+    log = Kinematics(times, np.repeat(tool(1), len(times), axis=0))
+    at = Frames(None, None, np.arange(int(250 * pause_s)) / 25)
     (tmp_path / "frames.csv").touch()
     shipped = Recording.open(paths.SHIPPED_RECORDING)
     recording = replace(shipped, folder=tmp_path, frames=at, fps=25.0, offset_s=0.0, kinematics=log)

@@ -272,6 +272,31 @@ def test_frames_that_are_lost_now_and_then_are_no_clock():
     assert best.name == "frame_order" and "lost ones" in best.cure
 
 
+@pytest.mark.parametrize(("jump_s", "wrong"), [(0.3, 0.0), (-0.23, 0.0), (0.02, 0.0), (0.1, 0.25)])
+def test_a_clock_that_jumps_is_named_with_its_cure(jump_s, wrong):
+    """The frames from 20 on carry times that are `jump_s` too early; a share of the detections is wrong."""
+    usual, rng = take(), np.random.default_rng(0)
+    rows = usual.data
+    stated_s = rows.time_s - jump_s * (rows.frame >= 20)
+    x = usual.kinematics.at(stated_s)[np.arange(len(rows)), rows.landmark]
+    u_left = rows.u_left + (rng.random((len(rows), 1)) < wrong) * rng.normal(0, 100, rows.u_left.shape)
+    jumped = replace(usual, data=replace(rows, time_s=stated_s, x_mm=x, u_left=u_left))
+    best = found(jumped).best
+    assert best.name == "frame_order" and best.text.startswith("From frame 20 on, the images show the tool ")
+    assert 1e-3 * best.value == pytest.approx(jump_s, abs=2e-3)
+    assert float(re.search(r"Add (\S+) s to the times from frame 20 on", best.cure)[1]) == pytest.approx(jump_s, abs=2e-3)
+
+
+def test_clocks_of_different_rates_are_not_said_to_differ_by_a_constant():
+    """In the middle they differ by 80 ms, which alone explains most of the residuals."""
+    usual = take(frames=40, fps=2.5)
+    rows = usual.data
+    stated_s = rows.time_s / 1.01
+    x = usual.kinematics.at(stated_s)[np.arange(len(rows)), rows.landmark]
+    best = found(replace(usual, data=replace(rows, time_s=stated_s, x_mm=x))).best
+    assert best.name == "clock_rate" and best.value == pytest.approx(1.01, abs=1e-3)
+
+
 def test_a_small_error_of_the_frame_rate_is_named():
     best = found(take(rate=1.02, frames=60)).best
     assert best.name == "clock_rate" and best.value == pytest.approx(1 / 1.02, abs=1e-3)
