@@ -236,7 +236,8 @@ class Recording:
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
-            (reach_mm < _SHORTEST_MM, "units", f"The robot reports the tips only {reach_mm:.2g} mm from the base.",
+            (reach_mm < _SHORTEST_MM and self.skeleton == LANDMARKS, "units",
+             f"The robot reports the tips only {reach_mm:.2g} mm from the base.",
              "Is kinematics.csv in mm? If it is in cm, multiply its positions by 10: all results in mm depend on it."),
         )  # fmt: skip
         return [Doubt(*doubt) for holds, *doubt in cases if holds]

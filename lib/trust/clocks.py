@@ -116,48 +116,53 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
 def _clock_jump(case: Case) -> Iterator[Hypothesis]:
     """A clock that jumps, or frames that were lost: from one frame on, the images show the tool at other instants."""
     problem = case.problem
-    if case.frames < 8:
+    found = [_jump(case, cut) for cut in case.frames * np.arange(1, 4) // 4] if case.frames >= 8 else []
+    if not (found := [one for one in found if one is not None]):
         return
-    cut = _cut(_by_frame(case, _losses(case, case.null, problem.x[:, 0])))
-    trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s), moves=problem.frame >= cut)
-    value = np.array([0.0, trial[misfit.sum(axis=1).argmin()]])  # the clock's shift before the cut, and the jump
-    for _ in range(3):
-        late = problem.frame >= cut
-        if (fitted := _refined(case, value, np.stack([np.ones(len(late)), late]))) is None:
-            return
-        fit, moved, value, sd = fitted
-        before, after = (_losses(case, fit, case.moved(shift)) for shift in np.cumsum(value))
-        last, cut = cut, int(np.cumsum(_by_frame(case, before - after)[::-1])[::-1][2:-2].argmax()) + 2
-        if cut == last:
-            break
+    cut, fit, moved, value, sd = max(found, key=lambda one: one[1].total)
     steady = max((case.fits[name].total for name in ("clock", "clock_rate") if name in case.fits), default=-np.inf)
     if abs(value[1]) > 5.0 * sd[1] and fit.total > steady + _WORTH:
-        number, size = problem.number[cut], f"{1e3 * abs(value[1]):.1f} +- {1e3 * sd[1]:.1f} ms"
-        text = f"From frame {number} on, the images show the tool {size} {'later' if value[1] > 0 else 'earlier'}."
-        cure = f"Look for lost ones there, or did a clock jump? Add {value[1]:.4f} s to the times from frame {number} on, "
+        (last, number), jump_s = problem.number[cut - 1 : cut + 1], float(value[1])
+        about = f" (or {last + 1})" if number > last + 1 else ""  # only some frames of a long recording are fitted
+        size = f"{1e3 * abs(jump_s):.1f} +- {1e3 * sd[1]:.1f} ms {'later' if jump_s > 0 else 'earlier'}"
+        text = f"From frame {number}{about} on, the images show the tool {size}."
+        cure = f"Look for lost ones there, or did a clock jump? Add {jump_s:.4f} s to the times from frame {number} on, "
         cure += "in frames.csv (frame, time_s)."
+        if jump_s < 0:  # such times would not increase
+            since_s = case.at_s[problem.frame == cut].min() + value.sum()
+            cure = f"Did the robot's clock jump back? Add {-jump_s:.4f} s to time_s in kinematics.csv "
+            cure += f"from {since_s:.2f} s on."
         if abs(value[0]) > 5.0 * sd[0]:
             cure += f" Add {value[0]:.4f} to offset_s as well."
         yield case.found("frame_order", fit, 5, (1e3 * value[1], 1e3 * sd[1], "ms"), text, cure, on=moved)
 
 
+def _jump(case: Case, cut: int) -> tuple[int, Robust, Problem, np.ndarray, np.ndarray] | None:
+    """The frame of a jump, searched from `cut`; the fit, its rows; the clock's shift before it and the jump (2,) s; their sds."""
+    problem = case.problem
+    late = problem.frame >= cut
+    trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s), moves=late)
+    known = np.isfinite(case.moved(trial[:, None] * late)).all(axis=2).sum(axis=1)
+    misfit = np.where(known > 0.75 * known.max(), misfit.sum(axis=1), np.inf)  # others move frames out of the log
+    value = np.array([0.0, trial[misfit.argmin()]])
+    for _ in range(4):
+        if (fitted := _refined(case, value, np.stack([np.ones(len(late)), late]))) is None:
+            return None
+        fit, moved, value, sd = fitted
+        before, after = (_losses(case, fit, case.moved(shift)) for shift in np.cumsum(value))
+        gain = np.bincount(problem.frame, before - after, case.frames)  # of each frame, if it comes after the jump
+        last, cut = cut, int(np.cumsum(gain[::-1])[::-1][2:-2].argmax()) + 2
+        late = problem.frame >= cut
+        if cut == last:
+            break
+    return cut, fit, moved, value, sd
+
+
 def _losses(case: Case, fit: Robust, x: np.ndarray) -> np.ndarray:
-    """(n,) robust losses of a fit with the landmarks at positions x (n, 3), NaN where these are unknown."""
+    """(n,) robust losses of a fit with the landmarks at positions x (n, 3); the mean where these are unknown."""
     r2 = (case.problem.missed(fit, np.repeat(x[:, None], 2, axis=1)) ** 2).sum(axis=2) / fit.shapes[0].scale ** 2
-    return np.where(case.problem.seen, np.log1p(r2), 0.0).sum(axis=1)
-
-
-def _by_frame(case: Case, losses: np.ndarray) -> np.ndarray:
-    """(frames,) sums of the known losses (n,)."""
-    return np.bincount(case.problem.frame, np.nan_to_num(losses), case.frames)
-
-
-def _cut(score: np.ndarray) -> int:
-    """The frame, not one of the first or last two, before and after which the means of a score differ most."""
-    before = np.arange(2, len(score) - 2)
-    total = np.cumsum(score)[before - 1]
-    apart = total / before - (score.sum() - total) / (len(score) - before)
-    return int(before[np.argmax(apart**2 * before * (len(score) - before))])
+    losses = np.where(case.problem.seen, np.log1p(r2), 0.0).sum(axis=1)
+    return np.where(np.isfinite(losses), losses, np.nanmean(losses))
 
 
 def _frame_order(case: Case) -> Iterator[Hypothesis]:
