@@ -321,6 +321,9 @@ class _Work:
                 teacher = self.with_any_base(chosen.labelled(self.labels), None, name="base of the chosen")
             except RefusalError:
                 raise refused from None
+            # Frames that do not show the robot's tool in both images may belong to other instants.
+            found = np.isfinite(chosen.u).all(axis=3).any(axis=2).all(axis=1)
+            teacher = replace(teacher, refused=np.union1d(teacher.refused, chosen.frame[~found]))
             self.report["notes"].append(
                 f"The detections do not teach ({str(refused).partition('. ')[0]}). So the robot's motion chose among several "
                 f"candidates in each image: {100 * np.isfinite(chosen.u).all((2, 3)).mean():.0f} % of the images show one."

@@ -138,7 +138,7 @@ def _clock_jump(case: Case) -> Iterator[Hypothesis]:
 
 
 def _jump(case: Case, cut: int) -> tuple[int, Robust, Problem, np.ndarray, np.ndarray] | None:
-    """The frame of a jump, searched from `cut`; the fit, its rows; the clock's shift before it and the jump (2,) s; their sds."""
+    """The frame of a jump, searched from `cut`; the fit, its rows; the shift before it and the jump (2,) s; their sds."""
     problem = case.problem
     late = problem.frame >= cut
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s), moves=late)
