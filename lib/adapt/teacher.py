@@ -38,6 +38,8 @@ _OPEN, _OPEN_SDS, _OPEN_SHARE = 0.12, 8.0, 0.2
 #: Relative error of an offset if the tool's axes of shut jaws are taken from a time farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
 _TURNS_S = 0.02  # between the samples of the log from which axes are taken; shorter steps are not worth their time
+#: Distance, as a share of the tool's length, within which an image shows the tool of another instant; those instants, s.
+_LATE, _OTHER_S = 0.03, np.linspace(-2.0, 2.0, 101)
 #: Least gain in log likelihood per detection by separate cameras for two parts of the time, if the cameras moved.  A smaller
 #: gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks can do, too.
 _SURE_MOVE = 0.5
@@ -311,7 +313,11 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
-    """The frames in which at least two landmarks are far from the robot's report by the same shift, in both images."""
+    """The frames in which at least two landmarks are far from the robot's report by the same shift, in both images.
+
+    One image alone may show another object, which the detector takes for the tool.  It only counts if it shows the tool where
+    the robot reports it at another instant: then the two images do not belong together.
+    """
     free = teacher.calibration.offsets
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
@@ -323,4 +329,20 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
     i, j = np.triu_indices(3, 1)  # pairs of landmarks
     alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
-    return seen.frame[(wrong[:, :, i] & wrong[:, :, j] & alike).all(axis=1).any(axis=1)]
+    shifted = wrong[:, :, i] & wrong[:, :, j] & alike
+    against = shifted.all(axis=1).any(axis=1)
+    apart = wrong.sum(axis=2) > 1  # (m, 2)
+    alone = apart.any(axis=1) & ~against
+    against[alone] = (apart[alone] & (_from_other_instants(teacher, seen.of(seen.frame[alone])) < _LATE)).any(axis=1)
+    return seen.frame[against]
+
+
+def _from_other_instants(teacher: Teacher, seen: Seen) -> np.ndarray:
+    """(m, 2) distance (RMS) of the landmarks from the robot's at the nearest instant, as a share of the tool's length."""
+    at = [replace(teacher.recording, offset_s=teacher.recording.offset_s + shift_s) for shift_s in _OTHER_S]
+    u = np.stack([replace(teacher, recording=then).project(seen.frame)[0] for then in at])  # (t, m, 2, 3, 2)
+    step, off = np.diff(u, axis=0), seen.u - u[:-1]
+    share = np.nansum(off * step, axis=(3, 4)) / np.nansum(step**2, axis=(3, 4))  # of the step, at its nearest point
+    off = (off - np.clip(share, 0, 1)[..., None, None] * step) / tool_length_px(u[:-1])[..., None, None]
+    r2 = (off**2).sum(axis=4)
+    return np.sqrt(np.nanmin(np.nansum(r2, axis=3) / np.isfinite(r2).sum(axis=3), axis=0, initial=np.inf))

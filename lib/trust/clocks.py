@@ -182,7 +182,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         if len(others) < 3:  # these may be spikes of the log
             continue
         rows = moved.used & astray[moved.frame][:, None] & np.isin((0, 1), views)
-        if np.median(np.linalg.norm(fit.residuals, axis=2)[rows]) > _ASTRAY * fit.shapes[0].scale:
+        if not rows.any() or np.median(np.linalg.norm(fit.residuals, axis=2)[rows]) > _ASTRAY * fit.shapes[0].scale:
             continue
         share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
         what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"

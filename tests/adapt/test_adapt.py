@@ -490,6 +490,18 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
         assert "moved" in found.report["notes"][0] and tune.calls
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_frames_whose_images_belong_to_two_instants_teach_nothing(world, tmp_path, late):
+    """One camera delivers images of 1.5 s later for a while; or in its images the detector takes another tool."""
+    shown = World()
+    shown.u[8:12, 1] = world.u[11:15, 1] if late else other_tool(world)[0][1]
+    tune = pupil(world)
+    found = adapt(world.record(tmp_path / "lab"), StandIn(shown.u), folder=tmp_path / "out", progress=False, tune=tune)
+    refused = {*range(8, 12)} & {*found.report["refused_frames"]}
+    assert refused == ({*range(8, 12)} if late else set())
+    assert np.nanmedian(np.linalg.norm(tune.calls[0]["off"], axis=-1)) < 1.5
+
+
 def test_a_robot_that_drifts_is_no_teacher_and_cameras_that_stand_still_are_not_blamed(world, tmp_path, monkeypatch):
     def drifting(time_s, x):
         return x + (time_s / np.ptp(time_s))[:, None, None] * np.array([0.3, 0.32, 0.24])
