@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
 from lib.files import write_json
-from lib.geometry import RigidTransform, cross, pair_covariance, points, store_array
+from lib.geometry import RigidTransform, pair_covariance, points, store_array
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
@@ -75,7 +75,7 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which `matrix` projects points to the same pixel, away from the (unmirrored) camera."""
-        direction = cross(*self.linear)
+        direction = np.cross(*self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:
@@ -97,7 +97,7 @@ class MatrixCamera:
         K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), up to signs
         signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
         K, R = K * signs, R * signs[:, None]
-        return Resection(K, np.vstack([R, cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 class AffineCamera(MatrixCamera):
