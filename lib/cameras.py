@@ -16,12 +16,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
 from lib.files import write_json
-from lib.geometry import RigidTransform, cross, pair_covariance, points, store_array
+from lib.geometry import RigidTransform, pair_covariance, points, store_array
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
-#: Number of points processed at once: their arrays stay in the processor's cache.
-_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which `matrix` projects points to the same pixel, away from the (unmirrored) camera."""
-        direction = cross(*self.linear)
+        direction = np.cross(*self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:
@@ -99,7 +97,7 @@ class MatrixCamera:
         K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), up to signs
         signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
         K, R = K * signs, R * signs[:, None]
-        return Resection(K, np.vstack([R, cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 class AffineCamera(MatrixCamera):
@@ -331,29 +329,27 @@ class StereoRig:
     def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray) -> Points:
         """A linear solution (the projection times its denominator), then two Gauss-Newton steps on the reprojection error."""
         x, covariance_mm2, epipolar = (np.full((len(y), *shape), np.nan) for shape in ((3,), (3, 3), ()))
-        known = np.flatnonzero(np.isfinite(y).all(axis=1))
+        rows = np.flatnonzero(np.isfinite(y).all(axis=1))
         near = [camera for camera in (self.left, self.right) if isinstance(camera, NearAffineCamera)]
-        for start in range(0, len(known), _BLOCK):
-            rows = known[start : start + _BLOCK]
-            W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
-            equations = []  # P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels
-            for camera, u in zip((self.left, self.right), (y[rows, :2], y[rows, 2:]), strict=True):
-                P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
-                equations.append(P[:2] - u[:, :, None] * P[2])
-            linear = np.concatenate(equations, axis=1)
-            found = _least_squares(linear[:, :, :3], -linear[:, :, 3], np.eye(4))[0]
-            step, seen = 0.0, np.ones(len(rows), dtype=bool)
-            for _ in range(3):  # the third time gives the covariance at the result
-                found = found + step
-                in_front = np.all([camera.depth_ratio(found) > 0 for camera in near], axis=0)
-                safe = np.where(in_front[:, None], found, near[0].reference_mm)  # placeholder for the others
-                J, r = self.jacobian(safe), y[rows] - np.hstack(self.project(safe))
-                step, inverse = _least_squares(J, r, W)
-                seen &= in_front
-            # Epipolar distance: the part of r that no change of the point explains, signed by the affine epipolar normal.
-            rest = r - (J @ _least_squares(J, r, np.eye(4))[0][:, :, None])[:, :, 0]
-            rest = np.sign(rest @ self.epipolar_normal) * np.linalg.norm(rest, axis=1)
-            x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], rest[seen]
+        W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
+        equations = []  # P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels
+        for camera, u in zip((self.left, self.right), (y[rows, :2], y[rows, 2:]), strict=True):
+            P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
+            equations.append(P[:2] - u[:, :, None] * P[2])
+        linear = np.concatenate(equations, axis=1)
+        found = _least_squares(linear[:, :, :3], -linear[:, :, 3], np.eye(4))[0]
+        step, seen = 0.0, np.ones(len(rows), dtype=bool)
+        for _ in range(3):  # the third time gives the covariance at the result
+            found = found + step
+            in_front = np.all([camera.depth_ratio(found) > 0 for camera in near], axis=0)
+            safe = np.where(in_front[:, None], found, near[0].reference_mm)  # placeholder for the others
+            J, r = self.jacobian(safe), y[rows] - np.hstack(self.project(safe))
+            step, inverse = _least_squares(J, r, W)
+            seen &= in_front
+        # Epipolar distance: the part of r that no change of the point explains, signed by the affine epipolar normal.
+        rest = r - (J @ _least_squares(J, r, np.eye(4))[0][:, :, None])[:, :, 0]
+        rest = np.sign(rest @ self.epipolar_normal) * np.linalg.norm(rest, axis=1)
+        x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], rest[seen]
         return Points(x, covariance_mm2, epipolar)
 
     def save(self, path: str | Path) -> None:

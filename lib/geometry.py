@@ -110,12 +110,6 @@ def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
     return np.where(both, np.linalg.inv(np.where(both, covariance, np.eye(used.shape[1]))), 0.0)[row]
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of vectors (..., 3); for few vectors `np.cross` takes several times as long."""
-    after = np.array([1, 2, 0])
-    return (a * b.take(after, -1, mode="wrap") - a.take(after, -1, mode="wrap") * b).take(after, -1, mode="wrap")
-
-
 def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distances (n, m / 2) of residuals (n, m), for each view by its block of covariances (n, m, m)."""
     r = residual.reshape(len(residual), residual.shape[1] // 2, 2, 1)

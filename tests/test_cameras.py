@@ -117,8 +117,7 @@ def test_triangulation_is_the_weighted_minimum_and_its_covariance_is_right(rig, 
 
 
 @pytest.mark.parametrize("each", [False, True])
-def test_near_affine_triangulation_is_that_of_a_general_solver(near, each, monkeypatch):
-    monkeypatch.setattr("lib.cameras._BLOCK", 7)
+def test_near_affine_triangulation_is_that_of_a_general_solver(near, each):
     rng = np.random.default_rng(5)
     x = workspace(23)
     u_left, u_right = (u + rng.normal(0, 3, u.shape) for u in near.project(x))

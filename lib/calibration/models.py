@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
-from lib.geometry import cross, precision
+from lib.geometry import precision
 from lib.least_squares import Minimum, minimise
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
@@ -118,12 +118,12 @@ class State:
     def rotation(self) -> np.ndarray:
         """(cameras, 3, 3), for bases other than affine: A = diag(zoom) rotation[:2]."""
         rows = self.A / self.zoom[:, :, None]
-        return np.concatenate([rows, cross(rows[:, :1], rows[:, 1:])], axis=1)
+        return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
 
     @cached_property
     def normals(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals r3 (cameras, 3) to the rows of A, away from the camera, and the lengths |a1 x a2| (cameras,)."""
-        normal = cross(self.A[:, 0], self.A[:, 1])
+        normal = np.cross(self.A[:, 0], self.A[:, 1])
         size = np.linalg.norm(normal, axis=1)
         return normal / size[:, None], size
 

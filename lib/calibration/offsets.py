@@ -23,7 +23,6 @@ from lib.calibration.robust import CompetingCamerasError, LooseCameraError
 from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.correspondences import Correspondences, DataError
-from lib.geometry import cross
 
 #: Step of the numerical derivatives by the offsets, mm or px.
 _STEP = 1e-4
@@ -69,7 +68,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         c = across / width
-        g = cross(m, c)
+        g = np.cross(m, c)
         if offset_mm is None:
             return np.where((width > 0.05 * size[:, None])[:, :, None], np.stack([m, c, g], axis=2), np.nan)
         # In the wanted axes the direction `a` of the reported vector along the tool is known, and the component along the
@@ -80,7 +79,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         a = np.stack(np.broadcast_arrays(straight, -middle[..., 1], -middle[..., 2]), axis=-1) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[..., 2:] * a
         up /= np.linalg.norm(up, axis=-1, keepdims=True)
-        side = cross(up, a)
+        side = np.cross(up, a)
         sine = np.clip((-apart[..., 2:] - beside * a[..., 2:]) / (width * up[..., 2:]), -1, 1)
         cosine = np.multiply.outer([1.0, -1.0], np.sqrt(1 - sine**2))
         own = np.stack([a, side, up], axis=-1)
@@ -143,7 +142,7 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
     known, shut = np.flatnonzero(has_axes & is_reported), np.flatnonzero(~has_axes & is_reported)
     if known.size and shut.size:
         nearest = known[np.searchsorted((time[known[1:]] + time[known[:-1]]) / 2, time[shut])]
-        axis = cross(along[nearest], along[shut])
+        axis = np.cross(along[nearest], along[shut])
         sine, cosine = np.linalg.norm(axis, axis=1), (along[nearest] * along[shut]).sum(axis=1)
         turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
         found[shut] = turn.as_matrix() @ axes[nearest]

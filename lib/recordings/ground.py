@@ -44,8 +44,7 @@ class Ground:
             return None
 
         def see() -> np.ndarray:
-            sides = ([getattr(frames[int(i)], side) for i in chosen] for side in ("left", "right"))
-            return np.stack([_median(images) for images in sides])
+            return _of_pairs([(frame.left, frame.right) for frame in (frames[int(i)] for i in chosen)])
 
         return cls(see, f"{name} in one light {chosen.tolist()}")
 
@@ -98,7 +97,7 @@ def relit(image: np.ndarray, like: np.ndarray) -> np.ndarray:
     return cv2.multiply(image, (*np.median(np.divide(*thinned), axis=0), 0.0))  # the median ignores the tool
 
 
-def _of_pairs(pairs: Sequence[np.ndarray]) -> np.ndarray:
+def _of_pairs(pairs: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     return np.stack([_median(images) for images in zip(*pairs, strict=True)])
 
 

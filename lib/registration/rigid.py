@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.geometry import RigidTransform, align_rotation, cross, finite_points, points
+from lib.geometry import RigidTransform, align_rotation, finite_points, points
 
 _STARTS = 12  # random triples of points as initial values, in addition to the least-squares solution
 _ITERATIONS = 300
@@ -44,7 +44,7 @@ class Registration:
 
 def motion_jacobian(offset: np.ndarray) -> np.ndarray:
     """(n, 3, 6): derivative by (omega, tau) of points at `offset` (n, 3) from the centre of rotation."""
-    return np.concatenate([cross(np.eye(3), offset[:, None]).mT, np.tile(np.eye(3), (len(offset), 1, 1))], axis=2)
+    return np.concatenate([np.cross(np.eye(3), offset[:, None]).mT, np.tile(np.eye(3), (len(offset), 1, 1))], axis=2)
 
 
 def check_spread(x: np.ndarray, name: str) -> None:

@@ -21,7 +21,6 @@ from lib.calibration.offsets import rows_axes, tool_axes
 from lib.calibration.robust import tightest_sample
 from lib.calibration.timing import Paths
 from lib.correspondences import Correspondences
-from lib.geometry import cross
 from lib.recordings import Kinematics
 
 SIDES = ("left", "right")
@@ -186,7 +185,7 @@ class Problem:
 
     def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """`columns` of `fit` for a turn and a shift of all landmarks together (6 numbers), scaled by `share` (n,) of rows."""
-        turns, shifts = cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
+        turns, shifts = np.cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
         moves = share[:, None, None, None] * np.concatenate([turns, shifts], axis=2)
         return lambda M: np.einsum("cij,nckj->ncik", M[:, :, :3], moves)
 
@@ -300,7 +299,7 @@ class Problem:
 
 def _by_nearness(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
     """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels, given `from_centre`, of positions x (..., n, 2, 3)."""
-    normal = cross(M[:, 0, :3], M[:, 1, :3])
+    normal = np.cross(M[:, 0, :3], M[:, 1, :3])
     normal /= -np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-12)
     return np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre
 
