@@ -36,7 +36,7 @@ _FAULTS = dict.fromkeys((
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
     "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
     "zoom_varies", "time_stamps", "backlash", "odd_pixels", "mixed_units", "same_images", "same_tips",
-), 0.15) | {"robot_drifts": 0.3, "robot_noise": 0.5}  # fmt: skip
+), 0.15) | {"robot_drifts": 0.3, "robot_noise": 0.3}  # fmt: skip
 #: Residuals below this share of the tool's length are harmless, whatever fault explains them.
 _HARMLESS = 0.01
 #: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.

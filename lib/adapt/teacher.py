@@ -342,7 +342,8 @@ def _from_other_instants(teacher: Teacher, seen: Seen) -> np.ndarray:
     at = [replace(teacher.recording, offset_s=teacher.recording.offset_s + shift_s) for shift_s in _OTHER_S]
     u = np.stack([replace(teacher, recording=then).project(seen.frame)[0] for then in at])  # (t, m, 2, 3, 2)
     step, off = np.diff(u, axis=0), seen.u - u[:-1]
-    share = np.nansum(off * step, axis=(3, 4)) / np.nansum(step**2, axis=(3, 4))  # of the step, at its nearest point
+    share = np.nansum(off * step, axis=(3, 4)) / np.maximum(np.nansum(step**2, axis=(3, 4)), 1e-9)  # at the nearest point
     off = (off - np.clip(share, 0, 1)[..., None, None] * step) / tool_length_px(u[:-1])[..., None, None]
     r2 = (off**2).sum(axis=4)
-    return np.sqrt(np.nanmin(np.nansum(r2, axis=3) / np.isfinite(r2).sum(axis=3), axis=0, initial=np.inf))
+    mean = np.nansum(r2, axis=3) / np.maximum(np.isfinite(r2).sum(axis=3), 1)
+    return np.sqrt(np.where(np.isfinite(r2).any(axis=3), mean, np.inf).min(axis=0))

@@ -448,7 +448,7 @@ def test_a_small_constant_error_is_the_detectors_own(world, recording):
     assert np.median(label_errors(world, teacher)[0][:, :, 0]) < 1.0
 
 
-# --- five faults of the robot
+# --- faults of the robot
 
 
 def frozen(time_s, x):
@@ -461,29 +461,35 @@ def bent(time_s, x):
     return x + np.array([0.0, 0.5, 0.0]) * ((x[..., 2:] - x[..., 2:].min()) / np.ptp(x[..., 2])) ** 2
 
 
+def coarse(time_s, x):
+    return 0.4 * np.rint(x / 0.4)
+
+
 def other_tool(world):
     """In a third of the frames the detector follows a tool that lies still in a corner."""
     still = world.u[5] + [[[90.0, 60.0]], [[95.0, 60.0]]]
     return {i: still for i in range(0, world.n, 3)}
 
 
-@pytest.mark.parametrize("fault", ["frozen", "rate", "bent", "moved", "other_tool"])
+@pytest.mark.parametrize("fault", ["frozen", "rate", "bent", "coarse", "moved", "other_tool"])
 def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
     there, detector, how = world, None, {}
     if fault == "moved":
         there = World(moved_from=28)
     elif fault == "rate":
         how = {"rate": 1.15}
-    elif fault in ("frozen", "bent"):
-        how = {"robot": frozen if fault == "frozen" else bent}
+    elif fault in ("frozen", "bent", "coarse"):
+        how = {"robot": {"frozen": frozen, "bent": bent, "coarse": coarse}[fault]}
     detector = StandIn(there.u, wrong=0.3, elsewhere=other_tool(there) if fault == "other_tool" else {})
     tune = pupil(there)
     found = adapt(there.record(tmp_path / fault, **how), detector, folder=tmp_path / "out", progress=False, tune=tune)
     for call in tune.calls:  # either nothing is taught, or what is taught is right
         off = np.linalg.norm(call["off"], axis=-1)
         assert np.nanmedian(off) < 1.5 and np.nanquantile(off, 0.9) < 4.0
-    if fault == "rate":
+    if fault in ("rate", "coarse"):
         assert not found.improved and found.report["reason"]
+    if fault == "coarse":
+        assert not tune.calls and found.report["reason"].startswith("robot: ")
     if fault == "frozen":
         assert set(range(12, 19)) <= set(found.report["refused_frames"])
     if fault == "moved":
