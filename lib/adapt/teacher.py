@@ -22,7 +22,7 @@ from lib.landmarks.recorded import Seen
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
-from lib.trust.fitting import SIDES, Problem
+from lib.trust.fitting import SIDES, Problem, Robust
 
 #: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
 #: wrong, they agree on another point, such as the elbow of a jaw.
@@ -43,6 +43,7 @@ _LATE, _OTHER_S = 0.03, np.linspace(-2.0, 2.0, 101)
 #: Least gain in log likelihood per detection by separate cameras for two parts of the time, if the cameras moved.  A smaller
 #: gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks can do, too.
 _SURE_MOVE = 0.5
+_STEP_S, _CLOCK_ROUNDS = 0.01, 3  # half of the time over which a velocity is measured; corrections of the clock by these
 _BEHIND = 0.1  # least distance from the camera of a visible point, as a share of the working distance
 #: Largest distance of the measured end of the shaft from the label, in standard deviations; a farther one is another edge.
 _ANOTHER_EDGE = 3.0
@@ -57,21 +58,34 @@ class OtherBaseError(RefusalError):
 
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and a note; all frames and "" if they did not."""
-    rows, frames = seen.rows(clock(recording, seen)[0]), seen.frame
-    rows = rows.subset(np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1))
-    problem = Problem.of(rows, recording.image_size_px)
-    used = int(problem.used.sum())
-    if used < 60 or len(frames) < 24:
-        return frames, ""
-    fit = problem.fit()
+    recording, frames = clock(recording, seen)[0], seen.frame
+    for _ in range(_CLOCK_ROUNDS):  # a clock that is a little off would be a reason for other cameras in a part of the path
+        rows = seen.rows(recording)
+        rows = rows.subset(np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1))
+        problem = Problem.of(rows, recording.image_size_px)
+        used = int(problem.used.sum())
+        if used < 60 or len(frames) < 24:
+            return frames, ""
+        log_s, own = rows.time_s + recording.offset_s, (np.arange(len(rows)), rows.landmark)
+        early, late = (recording.kinematics.at(log_s + step_s)[own] for step_s in (-_STEP_S, _STEP_S))
+        velocity = np.nan_to_num(late - early) / (2 * _STEP_S)
+        fit = _with_clock(problem, velocity)
+        recording = replace(recording, offset_s=recording.offset_s + float(np.clip(fit.theta[0], -0.1, 0.1)))
     first = np.unique(rows.frame)[problem.other_cameras(fit)[0]]
     parts = frames[frames < first], frames[frames >= first]
-    own = sum(Problem.of(rows.of_frames(part), recording.image_size_px).fit().total for part in parts)
-    # Separate cameras have 16 parameters more, and 12 allows for the choice of the cut.  Few frames may fit by chance.
-    if min(map(len, parts)) < 0.15 * len(frames) or own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
+    each = [Problem.of(rows.of_frames(part), recording.image_size_px) for part in parts]
+    apart = [_with_clock(one, velocity[np.isin(rows.frame, part)]).total for one, part in zip(each, parts, strict=True)]
+    # Separate cameras have 17 parameters more with the clock, and 12 allows for the choice of the cut.  Few frames may fit by
+    # chance.
+    if min(map(len, parts)) < 0.15 * len(frames) or sum(apart) - fit.total < 17 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
     return kept, f"The cameras moved or the tool slipped at frame {first}: only frames {kept[0]} to {kept[-1]} are used."
+
+
+def _with_clock(problem: Problem, velocity: np.ndarray) -> Robust:
+    """Cameras along with the clock, given the velocities (n, 3) mm/s of the rows."""
+    return problem.fit(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,8 +346,9 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     shifted = wrong[:, :, i] & wrong[:, :, j] & alike
     against = shifted.all(axis=1).any(axis=1)
     apart = wrong.sum(axis=2) > 1  # (m, 2)
-    alone = apart.any(axis=1) & ~against
-    against[alone] = (apart[alone] & (_from_other_instants(teacher, seen.of(seen.frame[alone])) < _LATE)).any(axis=1)
+    if (alone := apart.any(axis=1) & ~against).any():
+        late = _from_other_instants(teacher, seen.of(seen.frame[alone])) < _LATE
+        against[alone] = (apart[alone] & late).any(axis=1)
     return seen.frame[against]
 
 

@@ -15,8 +15,9 @@ from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, 
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
 _ROWS, _MOST_TRIALS = 400, 1200  # of the coarse search: most rows, and most trial shifts on each side of 0
 _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras do not fit or the best shift is at the edge
-_WORTH = 20.0  # gain in log likelihood by another clock or order from which the order of names as text is tried, too; and
-# by a clock that jumps over one that does not
+#: Gain in log likelihood by another clock or order from which the order of names as text is tried, too; and that of a clock
+#: that jumps over one that does not.
+_WORTH = 20.0
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
 _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
@@ -126,8 +127,8 @@ def _clock_jump(case: Case) -> Iterator[Hypothesis]:
         about = f" (or {last + 1})" if number > last + 1 else ""  # only some frames of a long recording are fitted
         size = f"{1e3 * abs(jump_s):.1f} +- {1e3 * sd[1]:.1f} ms {'later' if jump_s > 0 else 'earlier'}"
         text = f"From frame {number}{about} on, the images show the tool {size}."
-        cure = f"Look for lost ones there, or did a clock jump? Add {jump_s:.4f} s to the times from frame {number} on, "
-        cure += "in frames.csv (frame, time_s)."
+        cure = f"Look through the frames there for lost ones, or did a clock jump? Add {jump_s:.4f} s to the times "
+        cure += f"from frame {number} on, in frames.csv (frame, time_s)."
         if jump_s < 0:  # such times would not increase
             since_s = case.at_s[problem.frame == cut].min() + value.sum()
             cure = f"Did the robot's clock jump back? Add {-jump_s:.4f} s to time_s in kinematics.csv "

@@ -496,6 +496,16 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
         assert "moved" in found.report["notes"][0] and tune.calls
 
 
+@pytest.mark.parametrize("clock_s", [0.05, 0.15])
+def test_a_clock_that_is_a_little_off_does_not_look_like_moved_cameras(tmp_path, monkeypatch, clock_s):
+    """It may be too uncertain to be corrected before."""
+    there = World(seed=1)
+    record = there.record(tmp_path / "lab", clock_s=clock_s)
+    monkeypatch.setattr(teacher, "clock", lambda recording, seen: (recording, 0.02))
+    kept, note = teacher.longest_still(record, look(record, StandIn(there.u, noise_px=0.05), np.arange(there.n)))
+    assert len(kept) == there.n and not note
+
+
 @pytest.mark.parametrize("late", [True, False])
 def test_frames_whose_images_belong_to_two_instants_teach_nothing(world, tmp_path, late):
     """One camera delivers images of 1.5 s later for a while; or in its images the detector takes another tool."""
