@@ -32,7 +32,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 36  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 37  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -270,6 +270,8 @@ class _Work:
             moved, teacher = teacher, teacher.with_base(self.shaft)
             shift_mm = teacher.offset_mm[0] - moved.offset_mm[0]
             self.report["base_moved_mm"] = 0.0 if self.shaft is None else float(shift_mm @ self.shaft.axis)
+            aside = self.shaft and self.shaft.aside
+            self.report["base_moved_aside_mm"] = 0.0 if aside is None else float(shift_mm @ aside.axis)
             # A detector that looks near the robot's base may follow the robot, whatever is there.
             whole = self.whole.of(np.setdiff1d(learn, teacher.refused))
             if self.looks_near and self.knows_base and abs(apart := base_apart(teacher, whole)) > _APART:

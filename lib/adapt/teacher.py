@@ -158,24 +158,30 @@ class Teacher:
         return shown_axes(self.recording.landmarks_mm()[frames], self.calibration.cameras)
 
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
-        """The teacher whose base is moved along the shaft towards its measured end; itself if the two disagree.
+        """The teacher whose base is moved along the shaft towards its measured end, and across to the middle of its sides.
 
-        Label and measurement have the weights of their stated variances.
+        Label and measurement have the weights of their stated variances.  The teacher itself if the two disagree.
         """
         if end is None:
             return self
+        moved = self._with_base_along(end.axis, end.along, end.sd, end)
+        aside = None if moved is self else end.aside
+        return moved if aside is None else moved._with_base_along(aside.axis, aside.across, aside.sd, end)
+
+    def _with_base_along(self, axis: np.ndarray, step_px: np.ndarray, sd: float, end: ShaftEnd) -> "Teacher":
+        """The teacher whose base is moved along an axis (3,) of the tool, whose images are `step_px` (m, 2, 2)."""
         u, covariance = self.project(end.frame)
-        along = end.along / (end.along**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
-        shift = np.nanmedian(((end.u - u[:, :, 0]) * along).sum(axis=-1))
-        variance = np.nanmedian(np.einsum("msi,msij,msj->ms", along, covariance[:, :, 0], along))
-        total = variance + end.sd**2
+        step = step_px / (step_px**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
+        shift = np.nanmedian(((end.u - u[:, :, 0]) * step).sum(axis=-1))
+        variance = np.nanmedian(np.einsum("msi,msij,msj->ms", step, covariance[:, :, 0], step))
+        total = variance + sd**2
         if not abs(shift) < _ANOTHER_EDGE * np.sqrt(total):
             return self
         length_mm, offset, own = _length_mm(self.recording), self.offset_mm.copy(), self.offset_covariance_mm2.copy()
-        offset[0] += variance / total * shift * length_mm * end.axis
-        remaining = variance * end.sd**2 / total * length_mm**2
-        own_along = own[0] @ end.axis
-        if (before := own_along @ end.axis) > remaining:  # then it falls, as by a measurement
+        offset[0] += variance / total * shift * length_mm * axis
+        remaining = variance * sd**2 / total * length_mm**2
+        own_along = own[0] @ axis
+        if (before := own_along @ axis) > remaining:  # then it falls, as by a measurement
             own[0] -= (before - remaining) / before**2 * np.outer(own_along, own_along)
         return replace(self, offset_mm=offset, offset_covariance_mm2=own)
 

@@ -6,6 +6,8 @@ landmarks align the frames; in their mean the tool stays and the ground fades.  
 end appears as an ellipse around the base, of half axes r across the shaft and r sin(e) along it, where e is the angle between
 shaft and image.  So the outline is two lines, parallel or tapered, and the half of the ellipse on the side of the tips.
 
+The sides of the shaft also show where its axis lies: midway between them.
+
 The jaws may be angled.  Then the shaft does not point to the tips, but its direction in the tool's axes is the same in all
 frames: the one along which the mean of the aligned frames shows the sharpest sides.
 """
@@ -14,6 +16,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from lib.landmarks.windows import cut, window_from_image
@@ -24,7 +28,7 @@ from lib.recordings.annotations import inside
 _SIZE_PX, _LENGTH_PX = (161, 141), 200
 _MIDDLE_PX = (np.array(_SIZE_PX) - 1) / 2
 #: Searched positions of the shaft's end along the tool and across, and its radii, in pixels of the aligned pictures.
-_ALONG_PX, _ACROSS_PX = np.arange(-31, 32), np.array([-3.0, 0.0, 3.0])
+_ALONG_PX, _ACROSS_PX = np.arange(-31, 32), np.array([-6.0, -3.0, 0.0, 3.0, 6.0])
 _RADII_PX = np.concatenate([np.arange(2.0, 20.0), np.arange(20.0, 47.0, 2.0)])
 #: Slopes of the shaft's sides in its last pixels; a tapered shaft is only searched on the axis.
 _SLOPES, _TAPER_PX = (0.0, 0.2, 0.45), 12.0
@@ -54,6 +58,27 @@ _BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
+#: Searched positions of the shaft's axis across, differences from the radius that was found, length of the sides that show
+#: the axis, and blur, in pixels of the aligned pictures; the standard deviation of the axis, a share of the tool's length.
+_ASIDE_PX, _WIDER_PX, _ASIDE_LONG_PX, _ASIDE_BLUR_PX = np.arange(-9.0, 9.1, 0.25), np.arange(-3.0, 3.1, 0.25), 45.0, 1.5
+_ASIDE_SD = 0.003
+#: Least length of the mean image of a step across the shaft, relative to one without roll: else the roll varies too much.
+_LEAST_ASIDE = 0.5
+
+
+class Aside(NamedTuple):
+    """The distance of the shaft's axis from the given base, across the shaft.
+
+    Attributes:
+        axis: Unit vector (3,) across the shaft, in the tool's axes: the one that all images together show longest.
+        across: The image (m, 2, 2) px of a step along `axis` that is as long as the tool.
+        moved, sd: Shift from the given base along `axis`, and its standard deviation: shares of the tool's length.
+    """
+
+    axis: np.ndarray
+    across: np.ndarray
+    moved: float
+    sd: float
 
 
 class ShaftEnd(NamedTuple):
@@ -67,6 +92,7 @@ class ShaftEnd(NamedTuple):
         moved, sd: Shift from the given base towards the tips, and its standard deviation: shares of the tool's length.
         pictures: Means of the aligned pictures (2, 141, 161, 3) uint8 of left and right.
         outline: Points (2, n, 2) px of the fitted outline in them.
+        aside: How far the shaft's axis lies aside; None if the sides do not show it clearly.
     """
 
     frame: np.ndarray
@@ -77,6 +103,7 @@ class ShaftEnd(NamedTuple):
     sd: float
     pictures: np.ndarray
     outline: np.ndarray
+    aside: Aside | None = None
 
 
 def shaft_axis(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: np.ndarray) -> np.ndarray:
@@ -167,23 +194,58 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     end = np.mean([score[k].max(axis=0) for score in ends], axis=0)
     if end[i] < np.median(end) + _CLEAR:
         return None
-    own = [score[slope, k, :, i] for score in scores]  # by the position across
     tangent = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
     shown = _RADII_PX[k] * tangent / _LENGTH_PX  # half axis of the ellipse along the tool, in tool lengths
-    if k == len(_RADII_PX) - 1 or np.mean([score.max() for score in own]) < _LEAST or _BEVEL * shown > _LARGEST_BEVEL:
+    clearest = np.mean([score[slope, k, :, i].max() for score in scores])
+    if k == len(_RADII_PX) - 1 or clearest < _LEAST or _BEVEL * shown > _LARGEST_BEVEL:
         return None
     before, at, after = best[i - 1 : i + 2]
     moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
+    shorter = np.sqrt(1 - np.array([angle.mean() for angle in sines]) ** 2)  # by the angle between tool and image
+    long_px = _TAPER_PX if _SLOPES[slope] else _ASIDE_LONG_PX
+    found = zip(aligned, _RADII_PX[k] / shorter, strict=True)
+    shifts_px = [_middle(pictures, radius_px, _ALONG_PX[i], long_px) for (pictures, _), radius_px in found]
+    aside = _aside(axes, along, np.array(shifts_px) * shorter / _LENGTH_PX)
     outlines = []
-    for score, angle in zip(own, sines, strict=True):
+    for angle, shift_px in zip(sines, np.nan_to_num(shifts_px), strict=True):
         mean = angle.mean(keepdims=True)
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
-        outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, _ACROSS_PX[score.argmax()]])
+        outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, shift_px])
     moved += _BEVEL * shown
     sd = float(np.linalg.norm([_SD_TAPERED if _SLOPES[slope] else _SD, _SD_PX / np.nanmedian(size), _BEVEL_SD * shown]))
     means = np.stack([pictures.mean(axis=0) for pictures, _ in aligned]).round().astype(np.uint8)
-    return ShaftEnd(frames, base + moved * along, axis, along, moved, sd, means, np.stack(outlines))
+    u = base + moved * along + (0.0 if aside is None else aside.moved * aside.across)
+    return ShaftEnd(frames, u, axis, along, moved, sd, means, np.stack(outlines), aside)
+
+
+def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: float) -> float:
+    """How far the middle of a shaft's sides lies below that of the pictures (k, h, w, 3), in px; NaN if it is not clear.
+
+    The shaft ends at `end_px`, relative to the middle; its last `long_px` are averaged.  The sides are the two steepest steps
+    of colour, about twice the radius apart.
+    """
+    last = int(_MIDDLE_PX[0] + end_px) - 2
+    profile = _even(pictures)[:, :, max(last - int(long_px), 0) : last].mean(axis=(0, 2))
+    steep = np.linalg.norm(gaussian_filter1d(profile, _ASIDE_BLUR_PX, axis=0, order=1), axis=1)
+    middle, radius = np.meshgrid(_ASIDE_PX, radius_px + _WIDER_PX, indexing="ij")
+    steep_at = make_interp_spline(np.arange(len(steep)) - _MIDDLE_PX[1], steep)
+    clear = np.prod([steep_at((middle + side * radius).clip(-_MIDDLE_PX[1], _MIDDLE_PX[1])) for side in (-1, 1)], axis=0)
+    best = np.unravel_index(clear.argmax(), clear.shape)
+    # A maximum at the border is not one: a step nearer to the middle is a highlight, one farther away a shadow.
+    inner = all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True))
+    return _ASIDE_PX[best[0]] if inner else np.nan
+
+
+def _aside(axes: np.ndarray, along: np.ndarray, shifts: np.ndarray) -> Aside | None:
+    """How far the shaft's axis lies aside, by the mean shifts (2,) of the images; None if one is NaN or the roll varies."""
+    across = along[..., ::-1] * [-1, 1] / np.linalg.norm(along, axis=-1, keepdims=True)  # downwards in the pictures
+    shown = np.nanmean(np.einsum("mvi,mvij->mvj", across, axes) / _facing(axes)[..., None], axis=0)  # by steps along the axes
+    axis = shown.sum(axis=0) / np.linalg.norm(shown.sum(axis=0))
+    if np.isnan(shifts).any() or (size := shown @ axis).min() < _LEAST_ASIDE:
+        return None
+    left, right = shifts / size
+    return Aside(axis, axes @ axis, float(left + right) / 2, float(np.hypot(_ASIDE_SD, (left - right) / 2)))
 
 
 def _even(pictures: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from lib.adapt import teach
 from lib.landmarks import shaft
 from lib.landmarks.recorded import look
-from lib.landmarks.shaft import AHEAD, ShaftEnd, shaft_axis, shaft_end
+from lib.landmarks.shaft import AHEAD, Aside, ShaftEnd, shaft_axis, shaft_end
 from lib.recordings import StereoFrame
 from tests.adapt.world import StandIn, World
 
@@ -84,6 +84,38 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     assert np.abs(middle - 70).max() < 4  # the outline lies around the tool's axis, which is the row of the label
 
 
+@pytest.mark.parametrize(("share", "taper"), [(0.03, 0.0), (-0.02, 0.0), (0.02, 0.4)])
+def test_a_base_that_is_off_across_the_shaft_is_found_midway_between_its_sides(share, taper):
+    u, sine = tools(0.4), 0.4
+    axes = shown(u, sine)
+    found = shaft_end(pictured(u, sine, taper=taper), FRAMES, u[:, :, 0] + share * axes[..., 1], axes)
+    assert abs(found.aside.moved + share) < 0.004 and 0.003 <= found.aside.sd < 0.006
+    assert np.allclose(found.aside.axis, [0, 1, 0], atol=0.02)
+    assert np.allclose(found.aside.across, axes @ found.aside.axis)
+    middle = found.outline.mean(axis=1)[:, 1] - 70
+    np.testing.assert_allclose(middle, -share * 200 / np.sqrt(1 - sine**2), atol=1.0)
+
+
+def test_an_axis_is_not_measured_if_a_side_is_unclear_or_the_roll_varies(monkeypatch):
+    u = tools(0.4)
+    recording, axes = pictured(u, 0.4), shown(u, 0.4)
+    turn = np.linspace(0, 2 * np.pi, len(FRAMES), endpoint=False)
+    rolled = axes.copy()  # steps across the tool point everywhere
+    rolled[..., 1], rolled[..., 2] = (
+        np.cos(turn + part)[:, None, None] * axes[..., 1] + np.sin(turn + part)[:, None, None] * axes[..., 2]
+        for part in (0.0, np.pi / 2)
+    )
+    assert shaft_end(recording, FRAMES, u[:, :, 0], rolled).aside is None
+    row = np.abs(np.arange(141) - 70)
+    picture = np.repeat(np.where(row < 20, 60.0, 150.0)[None, :, None, None], 161, axis=2).repeat(3, axis=3)
+    assert shaft._middle(picture, 20.0, 0, 45.0) == 0
+    assert np.isnan(shaft._middle(picture, 15.0, 0, 45.0))  # the steps are those of another thing
+    assert np.isnan(shaft._middle(np.roll(picture, 12, axis=1), 20.0, 0, 45.0))
+    monkeypatch.setattr(shaft, "_middle", lambda *_: np.nan)
+    found = shaft_end(recording, FRAMES, u[:, :, 0], axes)
+    assert found.aside is None and np.allclose(found.u, u[:, :, 0] + found.moved * found.along)
+
+
 def test_a_shaft_that_does_not_point_to_the_tips_is_found_with_its_end(monkeypatch):
     """Jaws at an angle of 35 degrees: along the tips no shaft ends."""
     sine, axis = np.linspace(0.1, 0.6, len(FRAMES))[:, None, None], np.array([0.82, 0.5, 0.28])
@@ -97,7 +129,7 @@ def test_a_shaft_that_does_not_point_to_the_tips_is_found_with_its_end(monkeypat
     monkeypatch.setattr(shaft, "shaft_axis", lambda *_: AHEAD)
     straight = shaft_end(recording, FRAMES, base, axes)
     off = np.linalg.norm(end.u - u[:, :, 0], axis=-1) / np.linalg.norm(axes[..., 0], axis=-1)
-    assert off.max() < 0.02 and np.allclose(end.u, base + end.moved * end.along)
+    assert off.max() < 0.02 and np.allclose(end.u, base + end.moved * end.along + end.aside.moved * end.aside.across)
     assert straight is None or np.abs(straight.u - u[:, :, 0]).max() > 2 * np.abs(end.u - u[:, :, 0]).max()
 
 
@@ -167,6 +199,29 @@ def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edg
     shares = [moved(size, 0.01)[0] / size for size in (-0.03, -0.01, 0.005, 0.02)]
     np.testing.assert_allclose(shares, shares[0], rtol=1e-6)
     assert moved(0.5, 0.002)[1] is teacher and teacher.with_base(None) is teacher
+
+
+def test_the_base_moves_across_the_shaft_too_unless_the_end_is_another_edge(tmp_path):
+    world = World()
+    frames = np.arange(world.n)
+    recording = world.record(tmp_path / "lab")
+    teacher = teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames))
+    teacher = replace(teacher, offset_covariance_mm2=np.tile(0.1**2 * np.eye(3), (3, 1, 1)))
+    base, axes = teacher.labels(frames)[0][:, :, 0], teacher.axes_px(frames)
+    aside = Aside(np.array([0.0, 1.0, 0.0]), axes[..., 1], 0.02, 0.002)
+
+    def moved(along_share, aside_share, aside):
+        end = base + along_share * axes[..., 0] + aside_share * axes[..., 1]
+        return teacher.with_base(ShaftEnd(frames, end, AHEAD, axes[..., 0], along_share, 0.002, None, None, aside))
+
+    found, along = moved(0.01, 0.02, aside), moved(0.01, 0.02, None)
+    shift_mm = found.offset_mm[0] - along.offset_mm[0]
+    x_mm = recording.landmarks_mm()
+    length_mm = np.nanmedian(np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=1))
+    assert np.allclose(shift_mm[[0, 2]], 0) and 0.9 < shift_mm[1] / (0.02 * length_mm) < 1
+    assert found.offset_covariance_mm2[0, 1, 1] < 0.1 * along.offset_covariance_mm2[0, 1, 1]
+    assert moved(0.5, 0.02, aside) is teacher
+    assert np.array_equal(moved(0.01, 0.5, aside).offset_mm, moved(0.01, 0.5, None).offset_mm)
 
 
 def test_a_correction_along_an_angled_shaft_moves_the_base_there_and_makes_it_surer(tmp_path):
