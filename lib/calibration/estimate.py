@@ -15,7 +15,7 @@ from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px,
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Model, State, fit
 from lib.calibration.offsets import Unsettled, estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
-from lib.calibration.robust import consensus
+from lib.calibration.robust import NO_CONSENSUS_CURE, NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import pair_covariance, precision, view_distances2
@@ -32,6 +32,7 @@ _AS_LIKELY = 3.0
 #: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them), or, if negative, as
 #: mirrored images (a curved field may exceed three); step of its derivative.
 _FINITE, _MIRRORED, _STEP_PER_MM = 3.0, 8.0, 1e-6
+_LINE = 0.01  # ratio of the singular values of a camera's linear part, below which its image is a line
 
 
 @single_threaded_blas()
@@ -272,6 +273,10 @@ def _calibrate(
             break
         views = new
 
+    widest, narrowest = np.linalg.svd(minimum.state.A, compute_uv=False).T
+    if (narrowest < _LINE * widest).any():
+        what = "the camera that agrees best shows all positions on a line"
+        raise NoConsensusError(f"u: no consensus, {what}; {NO_CONSENSUS_CURE}.")
     parameter_covariance = inverse(minimum.information)
     if weighting == "paper":  # its weights are not the inverse noise covariances: the sandwich H^-1 G H^-1
         variance_u, variance_x = paper_variances(sigma_u, sigma_x)

@@ -30,6 +30,8 @@ _TAILS = 0.1  # share of outliers that may still be the tails of the noise; a la
 _LOOSE = 3.0  # factor on the largest noise up to which offsets of the landmarks may be the reason
 _NEARLY_ALL = 0.8  # if a camera explains more than this share of the rows, a subset may agree better by chance
 
+NO_CONSENSUS_CURE = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
+
 
 class NoConsensusError(DataError):
     """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
@@ -84,7 +86,6 @@ def _one_camera(
     n = len(u)
     if n < 8:
         return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
-    cure = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
     if threshold_px is None and n < _FEW:
         found = _by_growth(x, u, rng, least_mm)
         enough = min(8, n - n // 4)
@@ -93,16 +94,17 @@ def _one_camera(
         enough = max(8, int((_LEAST_SHARE if threshold_px is None else 0.1) * n))
     count, extent = int(found.keep.sum()), float(np.sqrt(np.prod(_extent(u))))
     if count < enough:
-        raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
+        what = f"only {count} of {n} rows agree on an affine camera"
+        raise NoConsensusError(f"{name}: no consensus, {what}; {NO_CONSENSUS_CURE}.")
     if n - count > 0.2 * n and (_extent(u[found.keep]) < _STILL * _extent(u).max()).all():
         what = f"the {count} of {n} rows that agree stand still in the image, so they show no moving tool"
-        raise NoConsensusError(f"{name}: no consensus, {what}; {cure}.")
+        raise NoConsensusError(f"{name}: no consensus, {what}; {NO_CONSENSUS_CURE}.")
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
         what = f"no affine camera agrees: the best one errs by {found.sigma_px:.3g} px in {count} of {n} rows"
         loose = 2 * count > n and found.sigma_px < _LOOSE * _LARGEST_NOISE[0] * extent
         kind = LooseCameraError if loose else NoConsensusError
-        raise kind(f"{name}: no consensus, {what}, and the others are not clearly separated; {cure}.")
+        raise kind(f"{name}: no consensus, {what}, and the others are not clearly separated; {NO_CONSENSUS_CURE}.")
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
     if threshold_px is not None or len(rest) < least:
         return found

@@ -152,3 +152,14 @@ def test_a_glint_that_stands_still_is_no_tool(share):
         else:
             off = np.hstack(found.rig.project(x_mm)) - np.hstack(rig.project(x_mm))
             assert np.sqrt(np.mean(off**2)) < 3.0
+
+
+@pytest.mark.parametrize("model", ["affine", "zero_skew"])
+def test_pixels_on_a_line_belong_to_no_camera(model):
+    """Wrong detections may lie so; the error must not be that of a camera's matrix, which no user gave."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-4, 4, (60, 3))
+    shown = [np.column_stack([100 * x[:, 0] + side * x[:, 2], np.full(60, 500.0)]) for side in (-9, 9)]
+    u = [exact + rng.normal(0, 1, (60, 2)) for exact in shown]
+    with pytest.raises(NoConsensusError, match="shows all positions on a line; check that"):
+        calibrate(x, u, model=model)
