@@ -42,9 +42,10 @@ _END = 0.6  # weight of the half ellipse; the sides have the rest
 _STEEPEST = 0.9  # largest sine; a steeper shaft shows its end from above
 #: A longer outline explains more edges, so the mean score counts times this power of the radius.  A highlight is shorter.
 _LARGE = 0.75
-#: Of maxima with this share of the largest, the one nearest to the tips is the end: steps and highlights lie behind it.  The
-#: score of its half ellipse must exceed the median of all positions by this much, and the mean score must be this large.
-_AS_CLEAR, _CLEAR, _LEAST = 0.75, 0.13, 0.2
+#: Of maxima with this share of the largest, the one whose ellipse reaches farthest to the tips is the end, since steps lie
+#: behind it; of those that reach as far within these pixels, the largest, since a highlight of the shaft ends there, too.
+#: The score of its half ellipse must exceed the median of all positions by this much, and the mean score must be this large.
+_AS_CLEAR, _SAME_FRONT_PX, _CLEAR, _LEAST = 0.75, 4.0, 0.13, 0.2
 AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
 #: Search of the shaft's direction, at half the scale of `_SIZE_PX`: side of the pictures, and the part of them that is used:
 #: its distance behind the base, its width and height.
@@ -59,9 +60,10 @@ _BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
 #: Searched positions of the shaft's axis across, differences from the radius that was found, length of the sides that show
-#: the axis, and blur, in pixels of the aligned pictures; the standard deviation of the axis, a share of the tool's length.
+#: the axis, and blur, in pixels of the aligned pictures.  Positions with this share of the best score are nearly as clear:
+#: half of their range is the standard deviation.
 _ASIDE_PX, _WIDER_PX, _ASIDE_LONG_PX, _ASIDE_BLUR_PX = np.arange(-9.0, 9.1, 0.25), np.arange(-3.0, 3.1, 0.25), 45.0, 1.5
-_ASIDE_SD = 0.003
+_NEARLY_AS_CLEAR = 0.9
 #: Least length of the mean image of a step across the shaft, relative to one without roll: else the roll varies too much.
 _LEAST_ASIDE = 0.5
 
@@ -189,12 +191,14 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     peaks = peaks[best[peaks] > _AS_CLEAR * best.max()]
     if not len(peaks):
         return None
-    i = peaks[-1]
+    tangent = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
+    front = _ALONG_PX[peaks] + tangent * _RADII_PX[clear.max(axis=0)[:, peaks].argmax(axis=0)]
+    farthest = peaks[front > front.max() - _SAME_FRONT_PX]
+    i = farthest[best[farthest].argmax()]
     slope, k = np.unravel_index(clear[:, :, i].argmax(), clear.shape[:2])
     end = np.mean([score[k].max(axis=0) for score in ends], axis=0)
     if end[i] < np.median(end) + _CLEAR:
         return None
-    tangent = np.mean([angle / np.sqrt(1 - angle**2) for angle in sines])
     shown = _RADII_PX[k] * tangent / _LENGTH_PX  # half axis of the ellipse along the tool, in tool lengths
     clearest = np.mean([score[slope, k, :, i].max() for score in scores])
     if k == len(_RADII_PX) - 1 or clearest < _LEAST or _BEVEL * shown > _LARGEST_BEVEL:
@@ -204,10 +208,10 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     shorter = np.sqrt(1 - np.array([angle.mean() for angle in sines]) ** 2)  # by the angle between tool and image
     long_px = _TAPER_PX if _SLOPES[slope] else _ASIDE_LONG_PX
     found = zip(aligned, _RADII_PX[k] / shorter, strict=True)
-    shifts_px = [_middle(pictures, radius_px, _ALONG_PX[i], long_px) for (pictures, _), radius_px in found]
-    aside = _aside(axes, along, np.array(shifts_px) * shorter / _LENGTH_PX)
+    shifts_px = np.array([_middle(pictures, radius_px, _ALONG_PX[i], long_px) for (pictures, _), radius_px in found])
+    aside = _aside(axes, along, shifts_px * shorter[:, None] / _LENGTH_PX)
     outlines = []
-    for angle, shift_px in zip(sines, np.nan_to_num(shifts_px), strict=True):
+    for angle, shift_px in zip(sines, np.nan_to_num(shifts_px[:, 0]), strict=True):
         mean = angle.mean(keepdims=True)
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
@@ -219,11 +223,11 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     return ShaftEnd(frames, u, axis, along, moved, sd, means, np.stack(outlines), aside)
 
 
-def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: float) -> float:
-    """How far the middle of a shaft's sides lies below that of the pictures (k, h, w, 3), in px; NaN if it is not clear.
+def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: float) -> tuple[float, float]:
+    """How far the middle of a shaft's sides lies below that of the pictures (k, h, w, 3), and its standard deviation, in px.
 
-    The shaft ends at `end_px`, relative to the middle; its last `long_px` are averaged.  The sides are the two steepest steps
-    of colour, about twice the radius apart.
+    Both are NaN if the sides are not clear.  The shaft ends at `end_px`, relative to the middle; its last `long_px` are
+    averaged.  The sides are the two steepest steps of colour, about twice the radius apart.
     """
     last = int(_MIDDLE_PX[0] + end_px) - 2
     profile = _even(pictures)[:, :, max(last - int(long_px), 0) : last].mean(axis=(0, 2))
@@ -233,19 +237,24 @@ def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: floa
     clear = np.prod([steep_at((middle + side * radius).clip(-_MIDDLE_PX[1], _MIDDLE_PX[1])) for side in (-1, 1)], axis=0)
     best = np.unravel_index(clear.argmax(), clear.shape)
     # A maximum at the border is not one: a step nearer to the middle is a highlight, one farther away a shadow.
-    inner = all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True))
-    return _ASIDE_PX[best[0]] if inner else np.nan
+    if not all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True)):
+        return np.nan, np.nan
+    return _ASIDE_PX[best[0]], np.ptp(_ASIDE_PX[clear.max(axis=1) > _NEARLY_AS_CLEAR * clear[best]]) / 2
 
 
 def _aside(axes: np.ndarray, along: np.ndarray, shifts: np.ndarray) -> Aside | None:
-    """How far the shaft's axis lies aside, by the mean shifts (2,) of the images; None if one is NaN or the roll varies."""
+    """How far the shaft's axis lies aside, by the mean shifts of the images and their standard deviations (2, 2).
+
+    None if one is NaN or the roll varies too much.
+    """
     across = along[..., ::-1] * [-1, 1] / np.linalg.norm(along, axis=-1, keepdims=True)  # downwards in the pictures
     shown = np.nanmean(np.einsum("mvi,mvij->mvj", across, axes) / _facing(axes)[..., None], axis=0)  # by steps along the axes
     axis = shown.sum(axis=0) / np.linalg.norm(shown.sum(axis=0))
     if np.isnan(shifts).any() or (size := shown @ axis).min() < _LEAST_ASIDE:
         return None
-    left, right = shifts / size
-    return Aside(axis, axes @ axis, float(left + right) / 2, float(np.hypot(_ASIDE_SD, (left - right) / 2)))
+    (left, left_sd), (right, right_sd) = shifts / size[:, None]
+    sd = np.linalg.norm([(left_sd + right_sd) / 2, (left - right) / 2])  # the same light falls on both
+    return Aside(axis, axes @ axis, float(left + right) / 2, float(sd))
 
 
 def _even(pictures: np.ndarray) -> np.ndarray:

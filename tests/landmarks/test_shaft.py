@@ -34,10 +34,11 @@ def shown(u, sine):
     return np.stack([along, across, LENGTH_PX * sine * along / size], axis=-1)
 
 
-def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, bevel=0.15, shaft=True, jaws=True):
+def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, bevel=0.15, shaft=True, jaws=True, highlight=0.0):
     """A recording of drawn tools on a ground that differs in every frame.
 
-    The shafts end at the base; the edge of the end has a `bevel` of 45 degrees, a share of the radius.
+    The shafts end at the base; the edge of the end has a `bevel` of 45 degrees, a share of the radius.  A bright band along the
+    shaft, `highlight` radii to either side of its axis, reaches to its end.
     """
     rng, pairs = np.random.default_rng(1), []
     for pair, axes in zip(u, shown(u, sine), strict=True):
@@ -61,6 +62,10 @@ def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, bevel=0.15, shaf
                 cv2.line(large, *(np.rint(4 * point).astype(int) for point in (base, tip)), 90.0, 16)
             if shaft:
                 cv2.fillPoly(large, [np.rint(4 * outline).astype(np.int32)], 60.0)
+                arc = base + circle[np.abs(np.sin(turn[:, 0])) <= highlight]
+                if len(arc):
+                    band = np.concatenate([arc, arc[::-1] - 250 * along])
+                    cv2.fillPoly(large, [np.rint(4 * band).astype(np.int32)], 250.0)
             small = cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA) + rng.normal(0, 3, SIZE[::-1])
             images.append(np.repeat(small.clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1))
         pairs.append(StereoFrame(*images, 0.0))
@@ -84,12 +89,23 @@ def test_a_base_that_is_off_along_the_shaft_is_found_within_a_hundredth_of_the_t
     assert np.abs(middle - 70).max() < 4  # the outline lies around the tool's axis, which is the row of the label
 
 
+def test_a_highlight_that_is_clearer_than_the_sides_is_not_taken_for_the_shaft():
+    """It ends at the same front, so its ellipse, which is smaller, would lie nearer to the tips."""
+    u, sine = tools(0.5), 0.5
+    axes = shown(u, sine)
+    found = shaft_end(pictured(u, sine, highlight=0.6), FRAMES, u[:, :, 0] - 0.04 * axes[..., 0], axes)
+    off = ((found.u - u[:, :, 0]) * axes[..., 0]).sum(axis=-1) / (axes[..., 0] ** 2).sum(axis=-1)
+    assert np.abs(off).max() < 1.5 * found.sd
+    radius_px = 12.0 / LENGTH_PX * 200 / np.sqrt(1 - sine**2)
+    np.testing.assert_allclose(np.ptp(found.outline[..., 1], axis=1) / 2, radius_px, rtol=0.1)
+
+
 @pytest.mark.parametrize(("share", "taper"), [(0.03, 0.0), (-0.02, 0.0), (0.02, 0.4)])
 def test_a_base_that_is_off_across_the_shaft_is_found_midway_between_its_sides(share, taper):
     u, sine = tools(0.4), 0.4
     axes = shown(u, sine)
     found = shaft_end(pictured(u, sine, taper=taper), FRAMES, u[:, :, 0] + share * axes[..., 1], axes)
-    assert abs(found.aside.moved + share) < 0.004 and 0.003 <= found.aside.sd < 0.006
+    assert abs(found.aside.moved + share) < 0.004 and 0.001 < found.aside.sd < 0.006
     assert np.allclose(found.aside.axis, [0, 1, 0], atol=0.02)
     assert np.allclose(found.aside.across, axes @ found.aside.axis)
     middle = found.outline.mean(axis=1)[:, 1] - 70
@@ -108,10 +124,11 @@ def test_an_axis_is_not_measured_if_a_side_is_unclear_or_the_roll_varies(monkeyp
     assert shaft_end(recording, FRAMES, u[:, :, 0], rolled).aside is None
     row = np.abs(np.arange(141) - 70)
     picture = np.repeat(np.where(row < 20, 60.0, 150.0)[None, :, None, None], 161, axis=2).repeat(3, axis=3)
-    assert shaft._middle(picture, 20.0, 0, 45.0) == 0
-    assert np.isnan(shaft._middle(picture, 15.0, 0, 45.0))  # the steps are those of another thing
-    assert np.isnan(shaft._middle(np.roll(picture, 12, axis=1), 20.0, 0, 45.0))
-    monkeypatch.setattr(shaft, "_middle", lambda *_: np.nan)
+    middle, sd = shaft._middle(picture, 20.0, 0, 45.0)
+    assert middle == 0 and 0 < sd < 1.0
+    assert np.isnan(shaft._middle(picture, 15.0, 0, 45.0)).all()  # the steps are those of another thing
+    assert np.isnan(shaft._middle(np.roll(picture, 12, axis=1), 20.0, 0, 45.0)).all()
+    monkeypatch.setattr(shaft, "_middle", lambda *_: (np.nan, np.nan))
     found = shaft_end(recording, FRAMES, u[:, :, 0], axes)
     assert found.aside is None and np.allclose(found.u, u[:, :, 0] + found.moved * found.along)
 
@@ -167,7 +184,7 @@ def test_a_shaft_that_ends_outside_the_pictures_or_is_thick_and_steep_gives_none
     u = tools(0.4)
     far = u[:, :, 0] - 0.4 * (u[:, :, 1:].mean(axis=2) - u[:, :, 0])
     outside = pictured(u, 0.4, jaws=False), FRAMES, far, shown(u, 0.4)
-    steep = pictured(tools(0.75), 0.75, radius_px=24.0), FRAMES, tools(0.75)[:, :, 0], shown(tools(0.75), 0.75)
+    steep = pictured(tools(0.75), 0.75, radius_px=18.0), FRAMES, tools(0.75)[:, :, 0], shown(tools(0.75), 0.75)
     assert shaft_end(*outside) is None and shaft_end(*steep) is None
     monkeypatch.setattr(shaft, "_CLEAR", -10.0)
     monkeypatch.setattr(shaft, "_LARGEST_BEVEL", 1.0)
