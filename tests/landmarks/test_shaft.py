@@ -37,8 +37,8 @@ def shown(u, sine):
 def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, bevel=0.15, shaft=True, jaws=True, highlight=0.0):
     """A recording of drawn tools on a ground that differs in every frame.
 
-    The shafts end at the base; the edge of the end has a `bevel` of 45 degrees, a share of the radius.  A bright band along the
-    shaft, `highlight` radii to either side of its axis, reaches to its end.
+    The shafts end at the base; the edge of the end has a `bevel` of 45 degrees, a share of the radius.  A bright band along
+    the shaft, `highlight` radii to either side of its axis, reaches to its end.
     """
     rng, pairs = np.random.default_rng(1), []
     for pair, axes in zip(u, shown(u, sine), strict=True):
