@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
-from lib.calibration.robust import CompetingCamerasError, LooseCameraError
+from lib.calibration.robust import CompetingCamerasError, LooseCameraError, consensus
 from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.correspondences import Correspondences, DataError
@@ -29,8 +29,9 @@ _STEP = 1e-4
 #: Largest offset (from the mean of all) that may explain two competing cameras, and largest offset that may explain a single
 #: landmark that is an outlier for the others' cameras.  Beyond these the detector finds another point of the tool.
 _MOST_MM, _MOST_ALONE_MM = 0.8, 0.25
-#: Number of first steps that use every detection, if cameras compete; later steps use the inliers.
-_WITH_ALL = 4
+#: Number of first steps that use given detections, if cameras compete or are loose; later steps use the inliers.
+_WITH_GIVEN = 4
+_FAR_OUT = 4.0  # distance from a loose camera, in standard deviations, beyond which offsets are not the reason
 #: Grid of initial offsets that turn the axes (a robot's model of its tool errs by tenths of a millimetre), and rows used.
 _GRID_MM, _STARTING_ROWS = (0.0, 0.2, -0.2), 2000
 #: Number of initial values that are refined, reweightings of the rows in a step, and decrease of the cost that ends them.
@@ -45,6 +46,9 @@ Axes = np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 class Unsettled(RuntimeWarning):
     """The offsets have not converged after the given number of steps."""
+
+
+_POOR = (DataError, np.linalg.LinAlgError, Unsettled)  # errors of attempts that fail
 
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
@@ -210,19 +214,23 @@ def estimate_offsets(
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
         return steps()
-    found, competing = None, None
+    found, competing, starts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
     try:
         found = steps()
     except (CompetingCamerasError, LooseCameraError) as error:
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found
-    with suppress(DataError, np.linalg.LinAlgError, Unsettled), warnings.catch_warnings(action="error", category=Unsettled):
-        other = steps(with_all=_WITH_ALL)
-        offset = other.offsets.offset[np.bincount(landmark) > 0]
-        most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
-        if np.linalg.norm(offset - centre, axis=1).max() <= most and _agree_alike(other, landmark):
-            return other
+    if isinstance(competing, LooseCameraError):  # wrong detections far outside its noise would spoil the offsets
+        with suppress(DataError):
+            starts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
+    for first_views in starts:
+        with suppress(*_POOR), warnings.catch_warnings(action="error", category=Unsettled):
+            other = steps(first_views=first_views)
+            offset = other.offsets.offset[np.bincount(landmark) > 0]
+            most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
+            if np.linalg.norm(offset - centre, axis=1).max() <= most and _agree_alike(other, landmark):
+                return other
     if competing:
         raise competing
     return found
@@ -237,23 +245,23 @@ def _agree_alike(found: Calibration, landmark: np.ndarray) -> bool:
 
 def _steps(
     fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
-    axes: Axes, prior_sd: float | None, iterations: int, start: Calibration | None, *, with_all: int = 0,
+    axes: Axes, prior_sd: float | None, iterations: int, start: Calibration | None, *, first_views: np.ndarray | None = None,
 ) -> Calibration:  # fmt: skip
-    """The Gauss-Newton steps of `estimate_offsets`; the first `with_all` of them use every detection, outliers too."""
+    """The Gauss-Newton steps of `estimate_offsets`; the first ones use `first_views` (n, cameras) instead of inliers."""
     offset = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3))
     p_value, score, views = np.nan, None, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
     step, share, before_px, before_inliers = np.zeros(offset.size), 1.0, np.inf, None
+    given = 0 if first_views is None else _WITH_GIVEN
 
     for i in range(iterations):
         own = axes(offset) if callable(axes) else np.eye(y.shape[1])[None].repeat(len(x), axis=0) if axes is None else axes
         shift = np.einsum("nij,nj->ni", own, offset[landmark])
-        if i < with_all:
-            views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
+        views = first_views if i < given else views
         found = fit(*((x, y - shift) if axes is None else (x + shift, y)), views=views)
         # Keep the inliers after a few steps, else they may alternate for ever; find them anew if other axes raise the error.
-        keeps = i >= with_all + 2 or (i > with_all and np.array_equal(found.view_inliers, before_inliers))
+        keeps = i >= given + 2 or (i > given and np.array_equal(found.view_inliers, before_inliers))
         views = found.view_inliers if keeps and found.reprojection_rms_px < 1.2 * before_px else None
         before_px, before_inliers = found.reprojection_rms_px, found.view_inliers
         rows = found.inliers
@@ -269,7 +277,7 @@ def _steps(
         share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # shorten steps that reverse their direction
         offset = offset + share * step.reshape(offset.shape)
         moved, least_sd = share * np.abs(step).max(), np.sqrt(np.diag(covariance).min())
-        if moved < 1e-3 * least_sd and i >= with_all:
+        if moved < 1e-3 * least_sd and i >= given:
             break
     else:
         if moved > 0.1 * least_sd:

@@ -38,7 +38,11 @@ class NoConsensusError(DataError):
 
 
 class LooseCameraError(NoConsensusError):
-    """Most rows agree on one camera, but loosely; constant offsets of the landmarks may be the reason."""
+    """Most rows agree on one camera, but loosely, by `sigma_px`; constant offsets of the landmarks may be the reason."""
+
+    def __init__(self, text: str, sigma_px: float) -> None:
+        super().__init__(text)
+        self.sigma_px = sigma_px
 
 
 class CompetingCamerasError(NoConsensusError):
@@ -102,9 +106,9 @@ def _one_camera(
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
         what = f"no affine camera agrees: the best one errs by {found.sigma_px:.3g} px in {count} of {n} rows"
+        text = f"{name}: no consensus, {what}, and the others are not clearly separated; {NO_CONSENSUS_CURE}."
         loose = 2 * count > n and found.sigma_px < _LOOSE * _LARGEST_NOISE[0] * extent
-        kind = LooseCameraError if loose else NoConsensusError
-        raise kind(f"{name}: no consensus, {what}, and the others are not clearly separated; {NO_CONSENSUS_CURE}.")
+        raise LooseCameraError(text, found.sigma_px) if loose else NoConsensusError(text)
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
     if threshold_px is not None or len(rest) < least:
         return found
