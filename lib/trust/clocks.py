@@ -23,6 +23,8 @@ _FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the camer
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
 _ASTRAY = 10.0  # largest residual of frames of other instants, over the scale; at no instant do wrong detections fit so well
 _OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
+#: The log likelihood by which a filter must explain the rows better than a late clock: on an even path they hardly differ.
+_SURELY_FILTERED, _UNFILTERED = 10.0, "Log the positions as they are measured, without a filter."
 #: The cure if one camera's images belong to other instants.
 PAIR_AGAIN = "Look for images that one camera lost, and pair left and right images of one instant."
 
@@ -245,16 +247,26 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 
 
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
-    """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
+    """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24.
+
+    Or a log that a filter of first order delays: the true position is x + tau x', if tau is its time constant.
+    """
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
     known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
     value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
     if value > 3 * sd:
         text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
-        cure = "Log the positions as they are measured, without a filter."
         size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
-        yield case.found("smoothed_log", fit, 1, size, text, cure, on=known)
+        yield case.found("smoothed_log", fit, 1, size, text, _UNFILTERED, on=known)
+    # A filter of first order, x' = (true x - x) / tau, makes the log late, too; it must explain more than a late clock.
+    velocity = case.velocity()
+    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], known)
+    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    late = max((case.fits[name].total for name in ("clock", "camera_clock") if name in case.fits), default=-np.inf)
+    if value > 3 * sd and fit.total > late + _SURELY_FILTERED:
+        text = f"The robot's log lags behind its motion, as by a filter of a time constant of {1e3 * value:.0f} ms."
+        yield case.found("smoothed_log", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, _UNFILTERED, on=known)
 
 
 def _backlash(case: Case) -> Iterator[Hypothesis]:

@@ -1,4 +1,7 @@
-"""Defects of images and tables: combs, repeated images and rounded numbers, which look like wrong times; a blurred eye."""
+"""Defects of images and tables: combs, repeated images, rounded numbers, frozen orientations, which look like other causes.
+
+And an eye that is blurred.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -27,16 +30,50 @@ _COMPARED, _SIZES, _ROUNDED, _BLANK = 12, 3, 1e-3, 1e-4
 #: recordings, of which some have unlike cameras, the lower of both shares was 0.77 or more.
 _BLURRED, _OFTEN = 0.6, 0.2
 _UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.5, 0.2, 0.1, 0.05)  # units to which times and positions may be rounded
+#: A log whose tool points at most so far from its mean direction never turns; images that show more than so much turn it; and
+#: by at most this share of that the two images may differ.  Medians over the frames; rad.  And the fewest frames for that.
+_TURNS, _SHOWN_TURNS, _UNLIKE, _FEWEST_TURNS = np.radians(1.0), np.radians(8.0), 0.5, 6
 
 
 def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:
-    """The diagnosis of `data`.  If its best cause is about times, a defect of the images or their times takes its place."""
+    """The diagnosis of `data`, in which a defect of images or tables takes the place of the cause that it looks like.
+
+    Most look like wrong times.  A log that never turns the tool may look like anything.
+    """
     best = diagnosis.best
-    if best is None or best.name not in _OF_TIMES:
+    if best is None:
         return diagnosis
-    found = _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
-    found = found or _rounded_log(best, recording)
+    found = _frozen_orientation(best, recording, data)
+    if best.name in _OF_TIMES:
+        found = found or _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
+        found = found or _rounded_log(best, recording)
     return Diagnosis((found, *(h for h in diagnosis.hypotheses if h.name != best.name))) if found else diagnosis
+
+
+def _frozen_orientation(best: Hypothesis, recording: Recording, data: Correspondences) -> Hypothesis | None:
+    """A log in which the tool always points in the same direction, although the images show that it turns."""
+    frames = np.unique(data.frame)
+    x, u = recording.landmarks_mm()[frames], np.stack([data.grid("u_left"), data.grid("u_right")])
+    if x.shape[1] != 3:
+        return None
+    along, shown = (tool[..., 1:, :].mean(axis=-2) - tool[..., 0, :] for tool in (x, u))
+    known = np.isfinite(along).all(axis=1) & np.isfinite(shown).all(axis=(0, 2))
+    if known.sum() < _FEWEST_TURNS:
+        return None
+    along = along[known] / np.linalg.norm(along[known], axis=1, keepdims=True)
+    mean = along.mean(axis=0) / np.linalg.norm(along.mean(axis=0))
+    logged = np.median(np.arccos((along @ mean).clip(-1, 1)))
+    turned = shown[:, known] @ [1, 1j]
+    turned /= np.abs(turned)
+    turned = np.angle(turned / turned.mean(axis=1, keepdims=True))
+    seen, unlike = np.median(np.abs(turned)), np.median(np.abs(turned[0] - turned[1]))
+    if logged > _TURNS or seen < _SHOWN_TURNS or unlike > _UNLIKE * seen:
+        return None
+    text = "In kinematics.csv the tool always points in the same direction, but in the images it turns by "
+    text += f"{np.degrees(seen):.0f} degrees (median of the angles to its mean direction)."
+    cure = "Does the orientation in the robot's log stand still? Or are the positions in the tool's own axes?"
+    size = {"value": float(np.degrees(seen)), "sd": 0.0, "unit": "degrees", "images": (0, 1)}
+    return replace(best, name="frozen_orientation", text=text, cure=cure, **size)
 
 
 def blurred(recording: Recording, frames: np.ndarray) -> list[Doubt]:

@@ -612,6 +612,21 @@ def test_the_habits_of_programs_that_write_files_are_named(way, strength, told):
     assert best.name in SPOILED[way, strength][0] and told in best.text
 
 
+@pytest.mark.parametrize("constant_s", [0.1, 0.2])
+def test_a_log_that_a_filter_delays_is_no_late_clock(constant_s):
+    usual = take()
+    time_s, x_mm = usual.kinematics.time_s, usual.kinematics.x_mm
+    late = 1 - np.exp(-np.diff(time_s, prepend=time_s[0]) / constant_s)
+    filtered = x_mm.copy()
+    for k in range(1, len(x_mm)):
+        filtered[k] = filtered[k - 1] + late[k] * (x_mm[k] - filtered[k - 1])
+    kinematics, rows = Kinematics(time_s, filtered), usual.data
+    x = kinematics.at(rows.time_s + usual.offset_s)[np.arange(len(rows)), rows.landmark]
+    best = found(replace(usual, data=replace(rows, x_mm=x), kinematics=kinematics)).best
+    assert best.name == "smoothed_log" and "lags behind" in best.text and "without a filter" in best.cure
+    assert best.value == pytest.approx(1e3 * constant_s, rel=0.1)
+
+
 def test_a_base_that_the_detector_hardly_knows_is_no_bent_tool():
     bent = take("tool bends", "3 %")
     names = [h.name for h in found(bent).hypotheses]

@@ -48,6 +48,25 @@ def pulled_down(images):
     return [delivered[i * 5 // 6] for i in range(len(images))]
 
 
+@pytest.mark.parametrize("cause", [CLOCK, replace(CLOCK, name="detector_unfit")])
+def test_a_log_that_never_turns_the_tool_is_named(recording, cause):
+    x_mm = recording.kinematics.x_mm
+    still = replace(recording, kinematics=replace(recording.kinematics, x_mm=x_mm[:, :1] + x_mm[:1] - x_mm[:1, :1]))
+    best = named(still, cause, noisy)
+    assert best.name == "frozen_orientation" and "turns by" in best.text and best.gain == CLOCK.gain
+    assert named(recording, cause, noisy).name == cause.name
+
+
+def test_detections_that_turn_in_one_image_only_accuse_no_log(recording):
+    x_mm = recording.kinematics.x_mm
+    still = replace(recording, kinematics=replace(recording.kinematics, x_mm=x_mm[:, :1] + x_mm[:1] - x_mm[:1, :1]))
+    u_left, u_right = recording.truth.u_left, recording.truth.u_right
+    unlike = of_recording(still, u_left, np.roll(u_right, 7, axis=0))
+    still_too = of_recording(still, *(u[:, :1] + u[:1] - u[:1, :1] for u in (u_left, u_right)))
+    for data in (unlike, still_too):
+        assert with_footage(Diagnosis((replace(CLOCK, name="detector_unfit"),)), still, data).best.name == "detector_unfit"
+
+
 @pytest.mark.parametrize(("edit", "name", "cure"), [
     (noisy, "clock", "Set offset_s."), (interlaced, "interlaced", "even rows"), (pulled_down, "frozen_video", "Drop images"),
 ])  # fmt: skip
