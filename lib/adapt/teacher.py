@@ -160,16 +160,17 @@ class Teacher:
     def with_base(self, end: ShaftEnd | None) -> "Teacher":
         """The teacher whose base is moved along the shaft towards its measured end, and across to the middle of its sides.
 
-        Label and measurement have the weights of their stated variances.  The teacher itself if the two disagree.
+        Label and measurement have the weights of their stated variances.  If they disagree along the shaft, the end is
+        that of another edge, and the base stays; if they disagree across it, the base moves only along it.
         """
         if end is None:
             return self
-        moved = self._with_base_along(end.axis, end.along, end.sd, end)
+        moved = self._with_moved_base(end.axis, end.along, end.sd, end)
         aside = None if moved is self else end.aside
-        return moved if aside is None else moved._with_base_along(aside.axis, aside.across, aside.sd, end)
+        return moved if aside is None else moved._with_moved_base(aside.axis, aside.across, aside.sd, end)
 
-    def _with_base_along(self, axis: np.ndarray, step_px: np.ndarray, sd: float, end: ShaftEnd) -> "Teacher":
-        """The teacher whose base is moved along an axis (3,) of the tool, whose images are `step_px` (m, 2, 2)."""
+    def _with_moved_base(self, axis: np.ndarray, step_px: np.ndarray, sd: float, end: ShaftEnd) -> "Teacher":
+        """The teacher whose base is moved along an axis (3,) of the tool, whose images are `step_px` (m, 2, 2), or itself."""
         u, covariance = self.project(end.frame)
         step = step_px / (step_px**2).sum(axis=-1, keepdims=True)  # so that shifts are shares of the tool's length
         shift = np.nanmedian(((end.u - u[:, :, 0]) * step).sum(axis=-1))

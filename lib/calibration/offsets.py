@@ -29,7 +29,7 @@ _STEP = 1e-4
 #: Largest offset (from the mean of all) that may explain two competing cameras, and largest offset that may explain a single
 #: landmark that is an outlier for the others' cameras.  Beyond these the detector finds another point of the tool.
 _MOST_MM, _MOST_ALONE_MM = 0.8, 0.25
-#: Number of first steps that use given detections, if cameras compete or are loose; later steps use the inliers.
+#: Number of first steps that use given detections, if consensus alone finds no good inliers; later steps use the inliers.
 _WITH_GIVEN = 4
 _FAR_OUT = 4.0  # distance from a loose camera, in standard deviations, beyond which offsets are not the reason
 #: Grid of initial offsets that turn the axes (a robot's model of its tool errs by tenths of a millimetre), and rows used.
@@ -48,7 +48,7 @@ class Unsettled(RuntimeWarning):
     """The offsets have not converged after the given number of steps."""
 
 
-_POOR = (DataError, np.linalg.LinAlgError, Unsettled)  # errors of attempts that fail
+_FAILURES = (DataError, np.linalg.LinAlgError, Unsettled)
 
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
@@ -225,7 +225,7 @@ def estimate_offsets(
         with suppress(DataError):
             starts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
     for first_views in starts:
-        with suppress(*_POOR), warnings.catch_warnings(action="error", category=Unsettled):
+        with suppress(*_FAILURES), warnings.catch_warnings(action="error", category=Unsettled):
             other = steps(first_views=first_views)
             offset = other.offsets.offset[np.bincount(landmark) > 0]
             most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)

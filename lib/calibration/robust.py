@@ -40,7 +40,7 @@ class NoConsensusError(DataError):
 class LooseCameraError(NoConsensusError):
     """Most rows agree on one camera, but loosely, by `sigma_px`; constant offsets of the landmarks may be the reason."""
 
-    def __init__(self, text: str, sigma_px: float) -> None:
+    def __init__(self, text: str, sigma_px: float = np.nan) -> None:  # a process that gets it sets the number later
         super().__init__(text)
         self.sigma_px = sigma_px
 

@@ -43,7 +43,7 @@ _STEEPEST = 0.9  # largest sine; a steeper shaft shows its end from above
 #: A longer outline explains more edges, so the mean score counts times this power of the radius.  A highlight is shorter.
 _LARGE = 0.75
 #: Of maxima with this share of the largest, the one whose ellipse reaches farthest to the tips is the end, since steps lie
-#: behind it; of those that reach as far within these pixels, the largest, since a highlight of the shaft ends there, too.
+#: behind it; of those that reach as far within these pixels, the clearest, since a highlight of the shaft ends there, too.
 #: The score of its half ellipse must exceed the median of all positions by this much, and the mean score must be this large.
 _AS_CLEAR, _SAME_FRONT_PX, _CLEAR, _LEAST = 0.75, 4.0, 0.13, 0.2
 AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the tips, in the tool's axes
@@ -60,10 +60,13 @@ _BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
 #: Searched positions of the shaft's axis across, differences from the radius that was found, length of the sides that show
-#: the axis, and blur, in pixels of the aligned pictures.  Positions with this share of the best score are nearly as clear:
-#: half of their range is the standard deviation.
+#: the axis, and blur, in pixels of the aligned pictures.
 _ASIDE_PX, _WIDER_PX, _ASIDE_LONG_PX, _ASIDE_BLUR_PX = np.arange(-9.0, 9.1, 0.25), np.arange(-3.0, 3.1, 0.25), 45.0, 1.5
-_NEARLY_AS_CLEAR = 0.9
+#: Least step of colour at one side, relative to the other side's.  Positions with this share of the best score are nearly as
+#: clear: half of their range is the standard deviation, beside that by light from one side, a share of the tool's length.
+_LEAST_STEP, _NEARLY_AS_CLEAR, _ASIDE_SD = 0.1, 0.9, 0.003
+#: Searched slopes of the shaft in the pictures, since its direction is known to some degrees; share of the ground's steps.
+_LEANS, _OF_GROUND = np.arange(-0.12, 0.121, 0.02), 0.8
 #: Least length of the mean image of a step across the shaft, relative to one without roll: else the roll varies too much.
 _LEAST_ASIDE = 0.5
 
@@ -168,7 +171,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
 
     Args:
         frames: Numbers (m,) of the frames.
-        base: Where the base is expected (m, 2, 2) px in them; it may be off along the shaft.
+        base: Where the base is expected (m, 2, 2) px in them; it may be off along the shaft, and a little across.
         axes: The images (m, 2, 2, 3) px of the tool's axes, each as long as the tool; images where it is NaN are left out.
     """
     axis = shaft_axis(recording, frames, base, axes)
@@ -211,8 +214,9 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     shifts_px = np.array([_middle(pictures, radius_px, _ALONG_PX[i], long_px) for (pictures, _), radius_px in found])
     aside = _aside(axes, along, shifts_px * shorter[:, None] / _LENGTH_PX)
     outlines = []
-    for angle, shift_px in zip(sines, np.nan_to_num(shifts_px[:, 0]), strict=True):
+    for angle, score, (shift_px, _) in zip(sines, scores, shifts_px, strict=True):
         mean = angle.mean(keepdims=True)
+        shift_px = _ACROSS_PX[score[slope, k, :, i].argmax()] if np.isnan(shift_px) else shift_px
         low, high = _sides(_RADII_PX[k], _SLOPES[slope], mean)[0][0]
         points = np.concatenate([low[::-1], _half_ellipse(_RADII_PX[k], mean)[0][0], high])
         outlines.append(points + _MIDDLE_PX + [moved * _LENGTH_PX, shift_px])
@@ -227,17 +231,28 @@ def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: floa
     """How far the middle of a shaft's sides lies below that of the pictures (k, h, w, 3), and its standard deviation, in px.
 
     Both are NaN if the sides are not clear.  The shaft ends at `end_px`, relative to the middle; its last `long_px` are
-    averaged.  The sides are the two steepest steps of colour, about twice the radius apart.
+    averaged, along the line of the clearest sides.  The sides are two steep steps of colour, about twice the radius apart.
     """
-    last = int(_MIDDLE_PX[0] + end_px) - 2
-    profile = _even(pictures)[:, :, max(last - int(long_px), 0) : last].mean(axis=(0, 2))
-    steep = np.linalg.norm(gaussian_filter1d(profile, _ASIDE_BLUR_PX, axis=0, order=1), axis=1)
-    middle, radius = np.meshgrid(_ASIDE_PX, radius_px + _WIDER_PX, indexing="ij")
-    steep_at = make_interp_spline(np.arange(len(steep)) - _MIDDLE_PX[1], steep)
-    clear = np.prod([steep_at((middle + side * radius).clip(-_MIDDLE_PX[1], _MIDDLE_PX[1])) for side in (-1, 1)], axis=0)
+    even, last = _even(pictures), int(_MIDDLE_PX[0] + end_px) - 2
+    first, high = max(last - int(long_px), 0), pictures.shape[1]
+    row, (middle, radius) = np.arange(high) - _MIDDLE_PX[1], np.meshgrid(_ASIDE_PX, radius_px + _WIDER_PX, indexing="ij")
+
+    def sides(lean: float) -> np.ndarray:
+        """(2, middles, radii): the steps of colour at the upper and at the lower side of a shaft with this slope."""
+        level = np.array([[1, 0, 0], [lean, 1, -lean * last]])  # turns the shaft level, and keeps its end in place
+        how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+        profiles = np.stack([cv2.warpAffine(one, level, (last, high), **how)[:, first:].mean(axis=1) for one in even])
+        # In the mean picture soft sides would fade; but in each picture the ground has steps, too, about the median.
+        steep = np.linalg.norm(gaussian_filter1d(profiles, _ASIDE_BLUR_PX, axis=1, order=1), axis=2).mean(axis=0)
+        steep_at = make_interp_spline(row, np.maximum(steep - _OF_GROUND * np.median(steep), 1e-3))
+        return np.stack([steep_at((middle + side * radius).clip(row[0], row[-1])) for side in (-1, 1)])
+
+    steps = max(map(sides, _LEANS), key=lambda steps: steps.prod(axis=0).max())
+    clear = steps.prod(axis=0)
     best = np.unravel_index(clear.argmax(), clear.shape)
     # A maximum at the border is not one: a step nearer to the middle is a highlight, one farther away a shadow.
-    if not all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True)):
+    inner = all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True))
+    if not inner or steps[:, *best].min() < _LEAST_STEP * steps[:, *best].max():
         return np.nan, np.nan
     return _ASIDE_PX[best[0]], np.ptp(_ASIDE_PX[clear.max(axis=1) > _NEARLY_AS_CLEAR * clear[best]]) / 2
 
@@ -253,7 +268,7 @@ def _aside(axes: np.ndarray, along: np.ndarray, shifts: np.ndarray) -> Aside | N
     if np.isnan(shifts).any() or (size := shown @ axis).min() < _LEAST_ASIDE:
         return None
     (left, left_sd), (right, right_sd) = shifts / size[:, None]
-    sd = np.linalg.norm([(left_sd + right_sd) / 2, (left - right) / 2])  # the same light falls on both
+    sd = np.linalg.norm([_ASIDE_SD, (left_sd + right_sd) / 2, (left - right) / 2])  # the same light falls on both
     return Aside(axis, axes @ axis, float(left + right) / 2, float(sd))
 
 

@@ -1,10 +1,13 @@
 """Heavy contamination, competing cameras, errors that last: what is found, what is refused, what is claimed."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.special import chdtri
 
 from lib.calibration import NoConsensusError, calibrate, estimate_time_offset
+from lib.calibration.robust import LooseCameraError
 from lib.correspondences import Correspondences
 from notebooks.studies.spoiling import Scene
 from tests.calibration.rigs import data, tool_sweep
@@ -156,10 +159,15 @@ def test_a_glint_that_stands_still_is_no_tool(share):
 
 @pytest.mark.parametrize("model", ["affine", "zero_skew"])
 def test_pixels_on_a_line_belong_to_no_camera(model):
-    """Wrong detections may lie so; the error must not be that of a camera's matrix, which no user gave."""
+    """Wrong detections may lie so."""
     rng = np.random.default_rng(0)
     x = rng.uniform(-4, 4, (60, 3))
     shown = [np.column_stack([100 * x[:, 0] + side * x[:, 2], np.full(60, 500.0)]) for side in (-9, 9)]
     u = [exact + rng.normal(0, 1, (60, 2)) for exact in shown]
     with pytest.raises(NoConsensusError, match="shows all positions on a line; check that"):
         calibrate(x, u, model=model)
+
+
+def test_a_loose_camera_is_told_by_another_process_too():
+    told = pickle.loads(pickle.dumps(LooseCameraError("u_left: no consensus", 7.0)))
+    assert str(told) == "u_left: no consensus" and told.sigma_px == 7.0

@@ -112,6 +112,25 @@ def test_a_base_that_is_off_across_the_shaft_is_found_midway_between_its_sides(s
     np.testing.assert_allclose(middle, -share * 200 / np.sqrt(1 - sine**2), atol=1.0)
 
 
+@pytest.mark.parametrize("degrees", [-4, 4])
+def test_the_axis_is_measured_at_the_end_of_a_shaft_whose_direction_is_off(monkeypatch, degrees):
+    u, angle = tools(0.4), np.radians(degrees)
+    axes = shown(u, 0.4)
+    recording = pictured(u, 0.4, axis=np.array([np.cos(angle), np.sin(angle), 0.0]))
+    monkeypatch.setattr(shaft, "shaft_axis", lambda *_: AHEAD)
+    found = shaft_end(recording, FRAMES, u[:, :, 0], axes)
+    assert abs(found.aside.moved) < 0.004
+
+
+@pytest.mark.parametrize(("sine", "radius_px", "share"), [(0.2, 8.0, 0.06), (0.5, 12.0, -0.08), (0.5, 4.0, -0.045)])
+def test_an_axis_outside_the_searched_range_is_not_measured(sine, radius_px, share):
+    """There one side and the ground beside it would be taken for two sides."""
+    u = tools(sine)
+    axes = shown(u, sine)
+    found = shaft_end(pictured(u, sine, radius_px=radius_px), FRAMES, u[:, :, 0] + share * axes[..., 1], axes)
+    assert found is None or found.aside is None
+
+
 def test_an_axis_is_not_measured_if_a_side_is_unclear_or_the_roll_varies(monkeypatch):
     u = tools(0.4)
     recording, axes = pictured(u, 0.4), shown(u, 0.4)
