@@ -59,13 +59,13 @@ def pictured(u, sine, *, axis=AHEAD, radius_px=12.0, taper=0.0, bevel=0.15, shaf
             behind += [end[0] - 250 * along - wide, end[0] - 12 * along - wide]
             outline = base + np.concatenate([end, behind])
             for tip in tips if jaws else ():
-                cv2.line(large, *(np.rint(4 * point).astype(int) for point in (base, tip)), 90.0, 16)
+                cv2.line(large, *(np.rint(4 * point + 1.5).astype(int) for point in (base, tip)), 90.0, 16)
             if shaft:
-                cv2.fillPoly(large, [np.rint(4 * outline).astype(np.int32)], 60.0)
+                cv2.fillPoly(large, [np.rint(4 * outline + 1.5).astype(np.int32)], 60.0)
                 arc = base + circle[np.abs(np.sin(turn[:, 0])) <= highlight]
                 if len(arc):
                     band = np.concatenate([arc, arc[::-1] - 250 * along])
-                    cv2.fillPoly(large, [np.rint(4 * band).astype(np.int32)], 250.0)
+                    cv2.fillPoly(large, [np.rint(4 * band + 1.5).astype(np.int32)], 250.0)
             small = cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA) + rng.normal(0, 3, SIZE[::-1])
             images.append(np.repeat(small.clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1))
         pairs.append(StereoFrame(*images, 0.0))
