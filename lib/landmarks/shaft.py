@@ -247,14 +247,14 @@ def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: floa
         steep_at = make_interp_spline(row, np.maximum(steep - _OF_GROUND * np.median(steep), 1e-3))
         return np.stack([steep_at((middle + side * radius).clip(row[0], row[-1])) for side in (-1, 1)])
 
-    steps = max(map(sides, _LEANS), key=lambda steps: steps.prod(axis=0).max())
+    steps = np.stack([sides(lean) for lean in _LEANS], axis=1)
     clear = steps.prod(axis=0)
     best = np.unravel_index(clear.argmax(), clear.shape)
     # A maximum at the border is not one: a step nearer to the middle is a highlight, one farther away a shadow.
     inner = all(0 < i < n - 1 for i, n in zip(best, clear.shape, strict=True))
     if not inner or steps[:, *best].min() < _LEAST_STEP * steps[:, *best].max():
         return np.nan, np.nan
-    return _ASIDE_PX[best[0]], np.ptp(_ASIDE_PX[clear.max(axis=1) > _NEARLY_AS_CLEAR * clear[best]]) / 2
+    return _ASIDE_PX[best[1]], np.ptp(_ASIDE_PX[clear[best[0]].max(axis=1) > _NEARLY_AS_CLEAR * clear[best]]) / 2
 
 
 def _aside(axes: np.ndarray, along: np.ndarray, shifts: np.ndarray) -> Aside | None:
