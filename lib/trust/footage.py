@@ -30,8 +30,8 @@ _COMPARED, _SIZES, _ROUNDED, _BLANK = 12, 3, 1e-3, 1e-4
 #: recordings, of which some have unlike cameras, the lower of both shares was 0.77 or more.
 _BLURRED, _OFTEN = 0.6, 0.2
 _UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.5, 0.2, 0.1, 0.05)  # units to which times and positions may be rounded
-#: A log whose tool points at most so far from its mean direction never turns; images that show more than so much turn it; and
-#: by at most this share of that the two images may differ.  Medians over the frames; rad.  And the fewest frames for that.
+#: Angles of the tool from its mean direction (medians over the frames, rad): the largest in a log that never turns the tool,
+#: and the least in images that show it turn.  The two images' angles may differ by this share.  And the fewest frames.
 _TURNS, _SHOWN_TURNS, _UNLIKE, _FEWEST_TURNS = np.radians(1.0), np.radians(8.0), 0.5, 6
 
 
