@@ -214,7 +214,7 @@ def estimate_offsets(
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
         return steps()
-    found, competing, starts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
+    found, competing, attempts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
     try:
         found = steps()
     except (CompetingCamerasError, LooseCameraError) as error:
@@ -223,8 +223,8 @@ def estimate_offsets(
         return found
     if isinstance(competing, LooseCameraError):  # wrong detections far outside its noise would spoil the offsets
         with suppress(DataError):
-            starts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
-    for first_views in starts:
+            attempts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
+    for first_views in attempts:
         with suppress(*_FAILURES), warnings.catch_warnings(action="error", category=Unsettled):
             other = steps(first_views=first_views)
             offset = other.offsets.offset[np.bincount(landmark) > 0]

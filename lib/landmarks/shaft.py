@@ -60,10 +60,12 @@ _BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
 #: Searched positions of the shaft's axis across, differences from the radius that was found, length of the sides that show
-#: the axis, and blur, in pixels of the aligned pictures.
+#: the axis, and blur, in pixels of the aligned pictures.  These and the next three settings were chosen on 26 recordings, by
+#: other renderers and of the validation population.
 _ASIDE_PX, _WIDER_PX, _ASIDE_LONG_PX, _ASIDE_BLUR_PX = np.arange(-9.0, 9.1, 0.25), np.arange(-3.0, 3.1, 0.25), 45.0, 1.5
-#: Least step of colour at one side, relative to the other side's.  Positions with this share of the best score are nearly as
-#: clear: half of their range is the standard deviation, beside that by light from one side, a share of the tool's length.
+#: Least step of colour at one side, relative to the other side's.  Positions with this share of the best score may be right,
+#: too: half of their range is one part of the standard deviation.  Light from one side causes the other part, which is a
+#: share of the tool's length.
 _LEAST_STEP, _NEARLY_AS_CLEAR, _ASIDE_SD = 0.1, 0.9, 0.003
 #: Searched slopes of the shaft in the pictures, since its direction is known to some degrees; share of the ground's steps.
 _LEANS, _OF_GROUND = np.arange(-0.12, 0.121, 0.02), 0.8
@@ -181,12 +183,11 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     aligned = _aligned(recording, frames, base, along)
     if min(len(pictures) for pictures, _ in aligned) < _GROUPS * _FEWEST:
         return None
-    found, sines = [], []
-    for side, (pictures, kept) in enumerate(aligned):
+    even, found, sines = [_even(pictures) for pictures, _ in aligned], [], []
+    for side, (pictures, (_, kept)) in enumerate(zip(even, aligned, strict=True)):
         groups = np.array_split(np.arange(len(pictures)), _GROUPS)
-        even = _even(pictures)
         sines.append(np.array([sine[kept[group], side].mean() for group in groups]))
-        found.append(_scores(np.stack([even[group].mean(axis=0) for group in groups]), sines[-1]))
+        found.append(_scores(np.stack([pictures[group].mean(axis=0) for group in groups]), sines[-1]))
     scores, ends = zip(*found, strict=True)
     clear = np.mean([score.max(axis=2) for score in scores], axis=0) * _RADII_PX[:, None] ** _LARGE
     best = clear.max(axis=(0, 1))
@@ -210,8 +211,8 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
     moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
     shorter = np.sqrt(1 - np.array([angle.mean() for angle in sines]) ** 2)  # by the angle between tool and image
     long_px = _TAPER_PX if _SLOPES[slope] else _ASIDE_LONG_PX
-    found = zip(aligned, _RADII_PX[k] / shorter, strict=True)
-    shifts_px = np.array([_middle(pictures, radius_px, _ALONG_PX[i], long_px) for (pictures, _), radius_px in found])
+    of_sides = zip(even, _RADII_PX[k] / shorter, strict=True)
+    shifts_px = np.array([_middle(pictures, radius_px, _ALONG_PX[i], long_px) for pictures, radius_px in of_sides])
     aside = _aside(axes, along, shifts_px * shorter[:, None] / _LENGTH_PX)
     outlines = []
     for angle, score, (shift_px, _) in zip(sines, scores, shifts_px, strict=True):
@@ -228,20 +229,20 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
 
 
 def _middle(pictures: np.ndarray, radius_px: float, end_px: float, long_px: float) -> tuple[float, float]:
-    """How far the middle of a shaft's sides lies below that of the pictures (k, h, w, 3), and its standard deviation, in px.
+    """How far the middle of a shaft's sides lies below that of even pictures (k, h, w, 3), and its standard deviation, in px.
 
     Both are NaN if the sides are not clear.  The shaft ends at `end_px`, relative to the middle; its last `long_px` are
     averaged, along the line of the clearest sides.  The sides are two steep steps of colour, about twice the radius apart.
     """
-    even, last = _even(pictures), int(_MIDDLE_PX[0] + end_px) - 2
-    first, high = max(last - int(long_px), 0), pictures.shape[1]
+    last, high = int(_MIDDLE_PX[0] + end_px) - 2, pictures.shape[1]
+    first = max(last - int(long_px), 0)
     row, (middle, radius) = np.arange(high) - _MIDDLE_PX[1], np.meshgrid(_ASIDE_PX, radius_px + _WIDER_PX, indexing="ij")
 
     def sides(lean: float) -> np.ndarray:
         """(2, middles, radii): the steps of colour at the upper and at the lower side of a shaft with this slope."""
-        level = np.array([[1, 0, 0], [lean, 1, -lean * last]])  # turns the shaft level, and keeps its end in place
-        how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-        profiles = np.stack([cv2.warpAffine(one, level, (last, high), **how)[:, first:].mean(axis=1) for one in even])
+        level = np.array([[1, 0, 0], [-lean, 1, lean * last]])  # levels the shaft, and keeps its end in place
+        levelled = (cut(picture, level, (last, high), border=cv2.BORDER_REPLICATE) for picture in pictures)
+        profiles = np.stack([picture[:, first:].mean(axis=1) for picture in levelled])
         # In the mean picture soft sides would fade; but in each picture the ground has steps, too, about the median.
         steep = np.linalg.norm(gaussian_filter1d(profiles, _ASIDE_BLUR_PX, axis=1, order=1), axis=2).mean(axis=0)
         steep_at = make_interp_spline(row, np.maximum(steep - _OF_GROUND * np.median(steep), 1e-3))

@@ -247,10 +247,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 
 
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
-    """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24.
-
-    Or a log that a filter of first order delays: the true position is x + tau x', if tau is its time constant.
-    """
+    """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
     known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
@@ -259,8 +256,15 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
         text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
         size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
         yield case.found("smoothed_log", fit, 1, size, text, _UNFILTERED, on=known)
-    # A filter of first order, x' = (true x - x) / tau, makes the log late, too; it must explain more than a late clock.
+
+
+def _filtered_log(case: Case) -> Iterator[Hypothesis]:
+    """A log that a filter of first order delays: the true position is x + tau dx/dt, if tau is its time constant.
+
+    The filter must explain the rows better than a late clock does.
+    """
     velocity = case.velocity()
+    known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
     fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], known)
     value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
     late = max((case.fits[name].total for name in ("clock", "camera_clock") if name in case.fits), default=-np.inf)
@@ -321,5 +325,6 @@ def log_elsewhere(data: Correspondences, kinematics: Kinematics | None, offset_s
 
 #: Tests that need the tool's path over time (`Case.paths`).
 TIME_TESTS = (
-    _clock, _clock_rate, _clock_jump, _frame_order, _sorted_as_text, _time_stamps, _smoothed_log, _backlash, _readout,
+    _clock, _clock_rate, _clock_jump, _frame_order, _sorted_as_text, _time_stamps, _smoothed_log, _filtered_log, _backlash,
+    _readout,
 )  # fmt: skip

@@ -210,11 +210,16 @@ def test_a_shaft_that_ends_outside_the_pictures_or_is_thick_and_steep_gives_none
     assert shaft_end(*outside) is not None and shaft_end(*steep) is not None
 
 
-def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edge(tmp_path):
+def taught(tmp_path):
+    """A teacher by a detector that knows the tool, and the numbers of the frames."""
     world = World()
     frames = np.arange(world.n)
     recording = world.record(tmp_path / "lab")
-    teacher = teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames))
+    return teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames)), frames
+
+
+def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edge(tmp_path):
+    teacher, frames = taught(tmp_path)
     teacher = replace(teacher, offset_covariance_mm2=np.tile(0.1**2 * np.eye(3), (3, 1, 1)))
     u = teacher.labels(frames)[0]
     axis = u[:, :, 1:].mean(axis=2) - u[:, :, 0]
@@ -238,10 +243,7 @@ def test_the_base_moves_by_as_much_as_the_label_is_unsure_but_not_to_another_edg
 
 
 def test_the_base_moves_across_the_shaft_too_unless_the_end_is_another_edge(tmp_path):
-    world = World()
-    frames = np.arange(world.n)
-    recording = world.record(tmp_path / "lab")
-    teacher = teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames))
+    teacher, frames = taught(tmp_path)
     teacher = replace(teacher, offset_covariance_mm2=np.tile(0.1**2 * np.eye(3), (3, 1, 1)))
     base, axes = teacher.labels(frames)[0][:, :, 0], teacher.axes_px(frames)
     aside = Aside(np.array([0.0, 1.0, 0.0]), axes[..., 1], 0.02, 0.002)
@@ -252,7 +254,7 @@ def test_the_base_moves_across_the_shaft_too_unless_the_end_is_another_edge(tmp_
 
     found, along = moved(0.01, 0.02, aside), moved(0.01, 0.02, None)
     shift_mm = found.offset_mm[0] - along.offset_mm[0]
-    x_mm = recording.landmarks_mm()
+    x_mm = teacher.recording.landmarks_mm()
     length_mm = np.nanmedian(np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=1))
     assert np.allclose(shift_mm[[0, 2]], 0) and 0.9 < shift_mm[1] / (0.02 * length_mm) < 1
     assert found.offset_covariance_mm2[0, 1, 1] < 0.1 * along.offset_covariance_mm2[0, 1, 1]
@@ -261,10 +263,7 @@ def test_the_base_moves_across_the_shaft_too_unless_the_end_is_another_edge(tmp_
 
 
 def test_a_correction_along_an_angled_shaft_moves_the_base_there_and_makes_it_surer(tmp_path):
-    world = World()
-    frames = np.arange(world.n)
-    recording = world.record(tmp_path / "lab")
-    teacher = teach(recording, look(recording, StandIn(world.u, noise_px=0.7), frames))
+    teacher, frames = taught(tmp_path)
     own = np.diag([0.2, 0.1, 0.05]) ** 2
     teacher = replace(teacher, offset_covariance_mm2=np.tile(own, (3, 1, 1)))
     axis = np.array([0.8, 0.0, 0.6])
