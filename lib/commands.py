@@ -175,8 +175,8 @@ def main_register(argv: list[str]) -> int:
     numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
     numbers |= {"median_epipolar_px": medians[0], "median_error_mm": medians[1]}
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
-    sd = f"standard deviation {found.translation_sd_mm.max():.3f} mm by these detections alone, without the calibration's error"
-    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, {sd}.")
+    sd = f"standard deviation {found.translation_sd_mm.max():.3f} mm by these detections alone"
+    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, {sd}, without the calibration's error.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where it is expected (median).")
     return _done(a, out, "registration", numbers | _offsets_entries(offsets), verdict)
