@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from lib.calibration import Calibration, CompetingCamerasError, calibrate, calibrate_as_shown
+from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import Unsettled
 from lib.calibration.timing import clock_error, estimate_time_offset
-from lib.correspondences import MIN_CONFIDENCE, TRAIN_FURTHER, DataError
+from lib.correspondences import MIN_CONFIDENCE, TRAIN_FURTHER, Correspondences, DataError
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.recorded import Seen
@@ -19,6 +19,7 @@ from lib.recordings import Recording
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.diagnosis import stated
 from lib.trust.fitting import Problem
+from lib.trust.footage import with_footage
 from lib.trust.verdict import with_scene
 
 #: Least confidences of the detections from which cameras are searched.
@@ -37,6 +38,7 @@ _FAULTS = dict.fromkeys((
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
     "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
     "zoom_varies", "time_stamps", "backlash", "odd_pixels", "mixed_units", "same_images", "same_tips",
+    "interlaced", "frozen_orientation",
 ), 0.15) | {"robot_drifts": 0.3, "robot_noise": 0.3}  # fmt: skip
 #: Residuals below this share of the tool's length are harmless, whatever fault explains them.
 _HARMLESS = 0.01
@@ -230,5 +232,11 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    best = with_scene(diagnose(rows, near=True, offsets=calibration.offsets, **stated(recording)), recording, seen.frame).best
+    return likeliest_fault(recording, rows, calibration.offsets)
+
+
+def likeliest_fault(recording: Recording, rows: Correspondences, offsets: LandmarkOffsets | None) -> Hypothesis | None:
+    """The fault that explains the rows best if it disqualifies the robot as a teacher, else None."""
+    found = diagnose(rows, near=True, offsets=offsets, **stated(recording))
+    best = with_footage(with_scene(found, recording, rows.frame), recording, rows).best
     return best if best is not None and best.explained >= _FAULTS.get(best.name, np.inf) else None

@@ -264,8 +264,10 @@ class _Work:
                 what = f"{LANDMARKS[sd.argmax()]} only to {100 * sd.max():.0f} % of the tool's length (standard deviation)"
                 raise RefusalError(f"detector: with the robot it gives {what}. {LABEL}")
             self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
-            if not self.knows_base and (self.shaft is None or abs(self.shaft.moved) > _CONFIRMED):
-                what = "it marks another point than the base of these angled jaws, and the base that was searched instead"
+            doubted = not (self.knows_base and teacher.agrees_on_base)
+            if doubted and (self.shaft is None or abs(self.shaft.moved) > _CONFIRMED):
+                base = "the robot reports" if self.knows_base else "was searched instead, at these angled jaws,"
+                what = f"it marks another point than the base, and the base that {base}"
                 raise RefusalError(f"detector: {what} is not where the aligned frames show the end of the shaft. {LABEL}")
             moved, teacher = teacher, teacher.with_base(self.shaft)
             shift_mm = teacher.offset_mm[0] - moved.offset_mm[0]

@@ -8,14 +8,15 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import least_squares
 
-from lib.adapt.alignment import LABEL, LEAST_RIGHT, POOR, RefusalError, aligned, clock, placed
+from lib.adapt.alignment import LABEL, LEAST_RIGHT, POOR, RefusalError, aligned, clock, likeliest_fault, placed
 from lib.adapt.looking import frozen, own_bias
 from lib.calibration import Calibration, LandmarkOffsets
 from lib.calibration.offsets import OWN_BIAS, carried, robots_part, shown_axes, tool_axes
 from lib.cameras import NearAffineCamera
-from lib.correspondences import LANDMARKS, MIN_CONFIDENCE
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
 from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.recorded import Seen
@@ -27,6 +28,8 @@ from lib.trust.fitting import SIDES, Problem, Robust
 #: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
 #: wrong, they agree on another point, such as the elbow of a jaw.
 _LEAST_SURE = 0.5
+_STRETCH = 3  # successive frames with exchanged tips that are no chance
+_FEWEST_SEEN = 20  # fewest detections of a landmark of which a share is judged
 #: Largest share of the frames in which the images may contradict the robot.
 _CONTRADICTED = 0.2
 #: Largest offset of a landmark: a share of the tool's length or a length in mm, whichever is larger.  An offset larger by two
@@ -104,6 +107,7 @@ class Teacher:
     refused: np.ndarray  # frames in which the robot is not believed
     right: float  # share of inliers among the landmarks
     turns: bool = False  # as `LandmarkOffsets.turns`
+    agrees_on_base: bool = True  # False: the detector marks another point than the robot's base
 
     def project(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
@@ -233,15 +237,10 @@ def teach(
     recording, calibration, fault, clock_sd_s, right = aligned(recording, used, by_hand=alone)
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
+    rows = used.rows(recording)
+    shares = _shares(rows, calibration.view_inliers)
     if opinion is None and before is None and by_hand is None:
-        rows, inliers = used.rows(recording), calibration.view_inliers
-        for k, tip in enumerate(LANDMARKS[1:], 1):  # the base has an end of its own, `with_base`
-            sure = rows.confidence[inliers & (rows.landmark == k)[:, None]]
-            if len(sure) and sure.mean() < _LEAST_SURE:
-                raise RefusalError(
-                    f"detector: it does not know this tool. What it takes for {tip} agrees with the robot, but its mean "
-                    f"confidence in that is {sure.mean():.2f}: it may be another point. {LABEL}"
-                )
+        _check_tips(recording, rows, calibration, shares)
     offsets, turns = calibration.offsets, False
     offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:
@@ -264,7 +263,8 @@ def teach(
         offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
-    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
+    agrees = shares[0] >= LEAST_RIGHT
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns, agrees)
     if clicked:
         teacher = _as_labelled(teacher, clicks)
     u, covariance = teacher.project(np.unique(np.linspace(0, len(recording) - 1, 200).astype(int)))
@@ -275,10 +275,35 @@ def teach(
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
-            f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool elsewhere than the robot "
-            f"reports: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
+            f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool, or both tips, elsewhere "
+            "than the robot reports: a frozen log, another clock, a moved microscope, exchanged tips, or a tool that the "
+            "robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
+
+
+def _shares(rows: Correspondences, inliers: np.ndarray) -> np.ndarray:
+    """(3,) share of inliers among the detections of each landmark, relative to the largest; 1 if there are few detections."""
+    each = [rows.landmark == k for k in range(len(LANDMARKS))]
+    seen = np.array([rows.seen[own].sum() for own in each])
+    share = np.array([inliers[own].sum() for own in each]) / np.maximum(seen, 1)
+    return np.where(seen < _FEWEST_SEEN, 1.0, share / max(share.max(), 1e-9))
+
+
+def _check_tips(recording: Recording, rows: Correspondences, calibration: Calibration, shares: np.ndarray) -> None:
+    """A `RefusalError` if a tip as detected hardly ever agrees with the robot, or only where its confidence is low."""
+    for k, tip in enumerate(LANDMARKS[1:], 1):  # the base has an end of its own, `Teacher.with_base`
+        if shares[k] < LEAST_RIGHT:
+            cause = likeliest_fault(recording, rows, None)
+            what = f"in most images {tip} is not where it reports it, although {LANDMARKS[shares.argmax()]} is."
+            cure = f"Check the orientation of the tool and the order of the tips in its log. If these are right: {LABEL}"
+            raise RefusalError(f"robot: {f'{cause.text} {cause.cure}' if cause else f'{what} {cure}'}")
+        sure = rows.confidence[calibration.view_inliers & (rows.landmark == k)[:, None]]
+        if len(sure) and sure.mean() < _LEAST_SURE:
+            raise RefusalError(
+                f"detector: it does not know this tool. What it takes for {tip} agrees with the robot, but its mean "
+                f"confidence in that is {sure.mean():.2f}: it may be another point. {LABEL}"
+            )
 
 
 def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> LandmarkOffsets | None:
@@ -336,6 +361,7 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     """The frames in which at least two landmarks are far from the robot's report by the same shift, in both images.
 
+    And stretches in which the tips are exchanged.
     One image alone may show another object, which the detector takes for the tool.  It only counts if it shows the tool where
     the robot reports it at another instant: then the two images do not belong together.
     """
@@ -352,11 +378,29 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
     shifted = wrong[:, :, i] & wrong[:, :, j] & alike
     against = shifted.all(axis=1).any(axis=1)
+    against |= _exchanged(u, seen)
     apart = wrong.sum(axis=2) > 1  # (m, 2)
     if (alone := apart.any(axis=1) & ~against).any():
         late = _from_other_instants(teacher, seen.of(seen.frame[alone])) < _LATE
         against[alone] = (apart[alone] & late).any(axis=1)
     return seen.frame[against]
+
+
+def _exchanged(u: np.ndarray, seen: Seen) -> np.ndarray:
+    """(m,) True in stretches of frames in which the tips are exchanged, either by the robot or by the detector.
+
+    `u` (m, 2, 3, 2) px are the robot's landmarks.  Exchanges in single frames are errors of the detector, which labels mend.
+    """
+    tips, length = u[:, :, 1:], tool_length_px(u)[..., None]
+    own, other = (np.linalg.norm(seen.u[:, :, 1:] - told, axis=-1) / length for told in (tips, tips[:, :, ::-1]))
+    near = (seen.confidence[..., 1:] >= MIN_CONFIDENCE) & (np.minimum(own, other) < NEAR) & (np.abs(own - other) > NEAR / 2)
+    votes, against = near.sum(axis=(1, 2)), (near & (other < own)).sum(axis=(1, 2))
+    known = np.flatnonzero(votes >= 2)
+    found = np.zeros(len(u), dtype=bool)
+    for some in sliding_window_view(known, _STRETCH) if len(known) >= _STRETCH else ():
+        if (against == votes)[some].all():
+            found[some[0] : some[-1] + 1] = True
+    return found
 
 
 def _from_other_instants(teacher: Teacher, seen: Seen) -> np.ndarray:

@@ -133,7 +133,8 @@ def _next(recording: Recording, a: Assessment, frames: range) -> str:
     if unspecific and a.verdict.is_red and recording.mistimed:
         return recording.mistimed
     if a.verdict.level != LEVELS[0]:
-        return a.verdict.reasons[0].cure if best is None else best.cure
+        cures = {reason.name: reason.cure for reason in a.verdict.reasons}  # for this recording
+        return a.verdict.reasons[0].cure if best is None else cures.get(best.name, best.cure)
     if len(frames) < len(recording):
         labels = "" if recording.skeleton == LANDMARKS else " --landmarks annotations"
         return f"Use it: `python3 -m lib calibrate RECORDING --frames {frames.start}:{frames.stop}{labels}`."

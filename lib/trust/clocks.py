@@ -175,6 +175,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # after lost frames most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
+    shifts = shifts[np.abs(shifts).argsort()]  # where the path is unknown, all are equal
     steps_px = np.nan_to_num(np.abs(np.diff(case.by_frame(case.problem.y), axis=0))).max(axis=(1, 3), initial=0.0)
     for views in ((0, 1), (0,), (1,)):
         if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:
@@ -200,7 +201,10 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
 
 
 def _chosen(case: Case, shifts: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray, float]:
-    """The fit with the best of `shifts` (s) for each frame, its rows, the choices (frames,), and the gain in likelihood."""
+    """The fit with the best of `shifts` (s) for each frame, its rows, the choices (frames,), and the gain in likelihood.
+
+    Equal ones prefer the first of the shifts.
+    """
     fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     penalty = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # entropy of the choices
@@ -212,7 +216,7 @@ def _time_stamps(case: Case) -> Iterator[Hypothesis]:
     """Times of the frames with errors of their own, so large that a trembling tool turns back meanwhile."""
     if case.frames < 8:
         return
-    tried = [np.linspace(-half_s, half_s, _STAMPS) for half_s in _STAMPS_S]
+    tried = [half_s * np.array(sorted(np.linspace(-1, 1, _STAMPS), key=abs)) for half_s in _STAMPS_S]
     shifts, (fit, moved, own, raw) = max(((shifts, _chosen(case, shifts)) for shifts in tried), key=lambda one: one[1][3])
     errors_s = shifts[own] - shifts[own].mean()
     if np.median(np.abs(errors_s)) > 0.5 * errors_s.std():  # else only some frames err, as by wrong detections

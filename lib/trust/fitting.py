@@ -384,7 +384,10 @@ class Case:
         return table
 
     def chosen(self, x: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray]:
-        """The fit with the best of positions x (t, n, 3) for each frame, in `views`; its rows; the choices (frames,)."""
+        """The fit with the best of positions x (t, n, 3) for each frame, in `views`; its rows; the choices (frames,).
+
+        Equal ones prefer the first.  Rows whose position is unknown (NaN) keep their own.
+        """
         problem, fit, own = self.problem, self.null, np.full(self.frames, -1)
         for _ in range(5):
             r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
@@ -393,7 +396,8 @@ class Case:
             before, own = own, np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
             if (own == before).all():
                 break
-            moved = problem.moved_to(x[own[problem.frame], np.arange(len(problem))], views)
+            at = x[own[problem.frame], np.arange(len(problem))]
+            moved = problem.moved_to(np.where(np.isfinite(at), at, problem.x[:, 0]), views)
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 

@@ -465,22 +465,37 @@ def coarse(time_s, x):
     return 0.4 * np.rint(x / 0.4)
 
 
+def unturned(time_s, x):
+    """The log's orientation stands still."""
+    return x[:, :1] + np.median(x - x[:, :1], axis=0)
+
+
+def turned_back(time_s, x):
+    """The log turns the tool to the other side."""
+    middle = np.median(x - x[:, :1], axis=0)
+    return x[:, :1] + 2 * middle - (x - x[:, :1])
+
+
+ERRING = {"frozen": frozen, "bent": bent, "coarse": coarse, "unturned": unturned, "turned_back": turned_back}
+
+
 def other_tool(world):
     """In a third of the frames the detector follows a tool that lies still in a corner."""
     still = world.u[5] + [[[90.0, 60.0]], [[95.0, 60.0]]]
     return {i: still for i in range(0, world.n, 3)}
 
 
-@pytest.mark.parametrize("fault", ["frozen", "rate", "bent", "coarse", "moved", "other_tool"])
+@pytest.mark.parametrize("fault", [*ERRING, "rate", "moved", "other_tool"])
 def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
     there, detector, how = world, None, {}
     if fault == "moved":
         there = World(moved_from=28)
     elif fault == "rate":
         how = {"rate": 1.15}
-    elif fault in ("frozen", "bent", "coarse"):
-        how = {"robot": {"frozen": frozen, "bent": bent, "coarse": coarse}[fault]}
-    detector = StandIn(there.u, wrong=0.3, elsewhere=other_tool(there) if fault == "other_tool" else {})
+    elif fault in ERRING:
+        how = {"robot": ERRING[fault]}
+    wrong = 0.05 if fault == "unturned" else 0.3
+    detector = StandIn(there.u, wrong=wrong, elsewhere=other_tool(there) if fault == "other_tool" else {})
     tune = pupil(there)
     found = adapt(there.record(tmp_path / fault, **how), detector, folder=tmp_path / "out", progress=False, tune=tune)
     for call in tune.calls:  # either nothing is taught, or what is taught is right
@@ -490,6 +505,9 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
         assert not found.improved and found.report["reason"]
     if fault == "coarse":
         assert not tune.calls and found.report["reason"].startswith("robot: ")
+    if fault in ("unturned", "turned_back"):
+        told = "always points in the same direction" if fault == "unturned" else "of the detections of tip_1 agree"
+        assert not tune.calls and told in found.report["reason"]
     if fault == "frozen":
         assert set(range(12, 19)) <= set(found.report["refused_frames"])
     if fault == "moved":

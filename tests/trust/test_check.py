@@ -14,6 +14,7 @@ from lib.recordings import Recording
 from lib.simulator import Design, Eye, Microscope, simulate
 from lib.trust import check as module
 from lib.trust.check import check, main
+from lib.trust.verdict import LEVELS, Reason, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_nothing_found_is_said_once_and_the_command_ends_well(folder, tmp_path, 
     assert content["verdict"] == "not trustworthy" and "no_detection" in [reason["name"] for reason in content["reasons"]]
     said = capsys.readouterr().out
     assert "the detector failed on 10 frames" in said and f"lib adapt {folder}" in said and "RECORDING" not in said
-    assert f"lib adapt {folder}" in content["next_step"] or content["next_step"] in said
+    assert f"lib adapt {folder}" in content["next_step"] and "record 17 frames or more, then" in content["next_step"]
 
 
 def test_where_nothing_is_calibrated_times_that_are_wrong_come_first(folder, detector):
@@ -79,7 +80,8 @@ def test_where_nothing_is_calibrated_times_that_are_wrong_come_first(folder, det
     assert found.next_step.startswith("The robot reports a position in 1 of 10 frames") and "adapt" not in found.next_step
     for name, first in (("detector_unfit", True), ("robot_noise", True), ("mirrored_images", False)):
         best = SimpleNamespace(name=name, cure="Flip it.")
-        calibrated = replace(found.assessment, calibration=object(), diagnosis=SimpleNamespace(best=best))
+        red = Verdict((Reason("other", LEVELS[2], "", ""),))
+        calibrated = replace(found.assessment, calibration=object(), diagnosis=SimpleNamespace(best=best), verdict=red)
         assert (module._next(late, calibrated, None) == late.mistimed) == first
         assert module._next(recording, calibrated, None) == "Flip it."
 

@@ -272,6 +272,18 @@ def test_frames_that_are_lost_now_and_then_are_no_clock():
     assert best.name == "frame_order" and "lost ones" in best.cure
 
 
+def test_frames_in_gaps_of_the_log_are_not_said_to_be_of_other_instants():
+    """One frame is of another instant.  Those in gaps have interpolated positions, and no path to search along."""
+    usual = take(frames=60)
+    starts = usual.data.time_s[np.searchsorted(usual.data.frame, [8, 17, 26, 35, 44])] - 0.04
+    log, rows = usual.kinematics, usual.data
+    in_gap = ((log.time_s > starts[:, None]) & (log.time_s < starts[:, None] + 0.16)).any(axis=0)
+    x = log.at(rows.time_s + 3 / 15)[np.arange(len(rows)), rows.landmark]
+    rows = replace(rows, x_mm=np.where((rows.frame == 12)[:, None], x, rows.x_mm))
+    best = found(replace(usual, data=rows, kinematics=Kinematics(log.time_s[~in_gap], log.x_mm[~in_gap]))).best
+    assert best is None
+
+
 @pytest.mark.parametrize(("jump_s", "wrong"), [(0.3, 0.0), (-0.23, 0.0), (0.02, 0.0), (0.1, 0.25)])
 def test_a_clock_that_jumps_is_named_with_its_cure(jump_s, wrong):
     """The frames from 20 on carry times that are `jump_s` too early; a share of the detections is wrong."""
