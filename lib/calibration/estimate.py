@@ -15,7 +15,7 @@ from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px,
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Model, State, fit
 from lib.calibration.offsets import Unsettled, estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
-from lib.calibration.robust import NO_CONSENSUS_CURE, NoConsensusError, consensus
+from lib.calibration.robust import NO_CONSENSUS_CURE, CompetingCamerasError, NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
 from lib.geometry import pair_covariance, precision, view_distances2
@@ -151,7 +151,15 @@ def calibrate_as_shown(
     >>> calibrate_as_shown(Correspondences.of_points(x, *u)).model
     'near_affine'
     """
-    found = calibrate(data, model=models[0], **options)
+    try:
+        found = calibrate(data, model=models[0], **options)
+    except CompetingCamerasError as error:  # perspective and offsets together may look like two cameras
+        with suppress(DataError, np.linalg.LinAlgError):
+            near = calibrate(data, model=models[1], **options)
+            value, sd = near.inverse_distance_per_mm
+            if value > _FINITE * sd:
+                return near
+        raise error
     state, x = found.minimum.state, found.minimum.work.points
     far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
     with suppress(DataError, np.linalg.LinAlgError):  # too few rows for one more parameter

@@ -28,6 +28,8 @@ _CONTRAST = 8.0
 _LARGEST_NOISE = (0.01, 0.25)
 _TAILS = 0.1  # share of outliers that may still be the tails of the noise; a larger share must be clearly separated
 _LOOSE = 3.0  # factor on the largest noise up to which offsets of the landmarks may be the reason
+#: Rounds of the fit of a camera at a finite distance, and its largest noise relative to that of the camera of some rows.
+_ROUNDS, _ALIKE = 4, 1.5
 _NEARLY_ALL = 0.8  # if a camera explains more than this share of the rows, a subset may agree better by chance
 
 NO_CONSENSUS_CURE = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
@@ -118,6 +120,8 @@ def _one_camera(
     beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
     if len(second) < least or other.sigma_px > 3.0 * found.sigma_px or not beside:
         return found
+    if (joint := _at_finite_distance(x, u, np.union1d(first, second), found)) is not None:
+        return joint
     early, late = sorted((first, second), key=np.median)
     cut = np.sort(np.concatenate([first, second]))[len(early)]
     if (early < cut).mean() + (late >= cut).mean() > 1.8:
@@ -126,6 +130,26 @@ def _one_camera(
         cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are mistaken for each other"
     text = f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
     raise CompetingCamerasError(text)
+
+
+def _at_finite_distance(x: np.ndarray, u: np.ndarray, rows: np.ndarray, found: _Found) -> _Found | None:
+    """The rows of both cameras that compete, if one at a finite distance explains them as well as `found` its own, else None.
+
+    It images x at u = M [x; 1] - z (u - c) / d, with z along the view, and c the middle of the pixels.
+    """
+    n, matrix, centre = len(u), found.matrix, np.median(u, axis=0)
+    H = np.column_stack([x, np.ones(n)])
+    for _ in range(_ROUNDS):
+        view = np.cross(*matrix[:, :3])
+        z = (x - x.mean(axis=0)) @ (view / np.linalg.norm(view))
+        of_matrix = np.einsum("ij,nk->nijk", np.eye(2), H).reshape(n, 2, 8)
+        D = np.concatenate([of_matrix, (z[:, None] * (centre - u))[..., None]], axis=2)
+        beta = np.linalg.lstsq(D[rows].reshape(-1, 9), u[rows].ravel())[0]
+        matrix, r2 = beta[:8].reshape(2, 4), ((u - D @ beta) ** 2).sum(axis=1)
+    sigma = float(np.sqrt(np.median(r2[rows]) / (2 * np.log(2))))  # of a coordinate
+    keep = r2 < gate(n) * sigma**2
+    alike = sigma <= _ALIKE * found.sigma_px and keep[rows].mean() >= _NEARLY_ALL
+    return _Found(keep, matrix, sigma, np.inf, gate(n)) if alike else None
 
 
 def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> _Found:

@@ -1,10 +1,12 @@
 """Estimators: exact recovery, the minimum itself, noise levels, outliers, covariances, clear errors."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from lib.calibration import (
@@ -16,6 +18,7 @@ from lib.calibration import (
 )
 from lib.calibration.affine import estimate_noise
 from lib.calibration.checks import check_spread, extents, eyes_exchanged
+from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
@@ -523,6 +526,24 @@ def test_dlt_refuses_what_it_cannot_solve():
         dlt(np.column_stack([x[:, :2], np.zeros(60)]), u[0])
     with pytest.raises(ValueError, match="59 points, x_mm has 60"):
         dlt(x, u[0][:-1])
+
+
+@pytest.mark.parametrize("offset_mm", [0.0, 0.15])
+def test_two_depths_before_a_near_microscope_are_no_two_cameras(offset_mm):
+    """Affine cameras for the near and for the far half differ by 8 % in scale; offsets of the landmarks differ, too."""
+    rng, n = np.random.default_rng(0), 40
+    base = rng.uniform([-4, -2.5, -0.3], [3, 2.5, 0.3], (n, 3)) + np.where(np.arange(n) % 2, 5, 0)[:, None] * [0, 0, 1]
+    turn = Rotation.from_euler("zyx", rng.normal(0, [0.3, 0.15, 0.3], (n, 3))).as_matrix()
+    half = rng.uniform(0.4, 0.8, n)
+    tool = np.stack([np.zeros((n, 3)), *(np.column_stack([np.full(n, 3.0), s * half, 0 * half]) for s in (-1, 1))], axis=1)
+    x = ROBOT_FROM_MICROSCOPE.apply((base[:, None] + np.einsum("nij,nkj->nki", turn, tool)).reshape(-1, 3))
+    u = [v + rng.normal(0, 0.4, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / 60).project(x)]
+    data = Correspondences.of_points(x, *u, frame=np.repeat(np.arange(n), 3), landmark=np.tile(np.arange(3), n))
+    offset = offset_mm * np.array([[1, 0.5, -0.5], [-1, 0.5, 0.5], [0.5, -1, 0.7]])
+    data = replace(data, x_mm=x + np.einsum("nij,nj->ni", np.nan_to_num(rows_axes(data)), offset[data.landmark]))
+    found = calibrate_as_shown(data)
+    assert found.model == "near_affine" and found.view_inliers.sum() == 6 * n and found.reprojection_rms_px < 0.7
+    assert found.inverse_distance_per_mm[0] == pytest.approx(1 / 62.5, rel=0.02)  # from the middle of the positions
 
 
 def test_cameras_have_a_finite_distance_only_where_the_detections_show_one():
