@@ -203,7 +203,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
 def _chosen(case: Case, shifts: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray, float]:
     """The fit with the best of `shifts` (s) for each frame, its rows, the choices (frames,), and the gain in likelihood.
 
-    Equal ones prefer the first of the shifts.
+    Of nearly equal ones the first is taken.
     """
     fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
     counts = np.bincount(own, minlength=len(shifts)) / case.frames

@@ -35,6 +35,7 @@ _LEAST_PX = 0.02  # smaller residuals are rounding errors
 _TRIAL_ROUNDS = 6  # rounds of a fit that only ranks candidate frames
 #: Loss of log likelihood that rules out another frame for a change: errors that depend on the pose made 18 of a true one.
 _SURE_CUT = 25.0
+_ALIKE = 1.0  # difference of the losses of a frame's positions between which nothing decides
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # longest step between frames whose positions can replace the robot's log
 _PARAMETERS = 21  # two cameras with one distance (17), and about as many of the nine offsets as the data determine
@@ -386,14 +387,15 @@ class Case:
     def chosen(self, x: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray]:
         """The fit with the best of positions x (t, n, 3) for each frame, in `views`; its rows; the choices (frames,).
 
-        Equal ones prefer the first.  Rows whose position is unknown (NaN) keep their own.
+        Of nearly equal ones the first is taken.  Rows whose position is unknown (NaN) keep their own.
         """
         problem, fit, own = self.problem, self.null, np.full(self.frames, -1)
         for _ in range(5):
             r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0)
             loss = loss[:, :, views].sum(axis=2)
-            before, own = own, np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+            loss = np.array([np.bincount(problem.frame, row, self.frames) for row in loss])
+            before, own = own, (loss <= loss.min(axis=0) + _ALIKE).argmax(axis=0)
             if (own == before).all():
                 break
             at = x[own[problem.frame], np.arange(len(problem))]
