@@ -220,15 +220,19 @@ def _time_stamps(case: Case) -> Iterator[Hypothesis]:
     shifts, (fit, moved, own, raw) = max(((shifts, _chosen(case, shifts)) for shifts in tried), key=lambda one: one[1][3])
     errors_s = shifts[own] - shifts[own].mean()
     if np.median(np.abs(errors_s)) > 0.5 * errors_s.std():  # else only some frames err, as by wrong detections
-        sd_s = float(errors_s.std())
-        yield case.found("time_stamps", fit, 1, (1e3 * sd_s, 0.0, "ms"), *stamps_err(sd_s), on=moved, raw=raw)
+        sd_s, mean_s = float(errors_s.std()), float(shifts[own].mean())
+        yield case.found("time_stamps", fit, 1, (1e3 * sd_s, 0.0, "ms"), *stamps_err(sd_s, mean_s), on=moved, raw=raw)
 
 
-def stamps_err(sd_s: float) -> tuple[str, str]:
-    """Text and cure of times with independent errors."""
-    text = f"The time stamps of frames or log have independent errors of {1e3 * sd_s:.2g} ms (RMS)."
+def stamps_err(sd_s: float, mean_s: float) -> tuple[str, str]:
+    """Text and cure of times with independent errors about a mean."""
+    text = f"The time stamps of frames or log have independent errors of {1e3 * sd_s:.2g} ms (RMS)"
     cure = "Record when the camera exposed each frame and when the robot measured each position; do not round. Did a program "
-    return text, cure + "change the frame rate? It repeats or drops images: export the camera's own."
+    cure += "change the frame rate? It repeats or drops images: export the camera's own."
+    if abs(mean_s) > sd_s:
+        text += f", and the clocks differ by about {1e3 * mean_s:.0f} ms"
+        cure = f"Add {mean_s:.3f} to offset_s in recording.toml. {cure}"
+    return f"{text}.", cure
 
 
 def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:

@@ -22,6 +22,7 @@ ROBOT_ERRS = (
     "Check times, units, columns of kinematics.csv; the robot's accuracy, which may depend on its position; "
     "and how its poses become points: the tool's transform, and the convention of rotations (or are they inverse?)."
 )
+_COMMON = 0.8  # share of the gain by times of each frame, above which one clock that is off is the reason
 _MOST = 0.5  # least median size of the parameters over their RMS: gross errors only affect a part of the frames
 
 
@@ -60,9 +61,13 @@ def unsteady(case: Case) -> Iterator[Hypothesis]:
     if moves and case.paths:
         velocity = np.nan_to_num(case.velocity())
         found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
-        if _is_distinct(case, found):
-            size = 1e3 * found.sd, 0.0, "ms"
-            yield case.found("time_stamps", found.fit, 1, size, *stamps_err(found.sd), raw=found.raw)
+        late = case.fits.get("clock", case.null)
+        if _is_distinct(case, found) and late.total - case.null.total < _COMMON * found.raw:
+            weight = np.bincount(problem.frame, (velocity**2).sum(axis=1), case.frames)  # a robot at rest shows no times
+            mean_s = float(np.average(found.theta[:, 0], weights=weight))
+            sd_s = float(np.sqrt(np.average((found.theta[:, 0] - mean_s) ** 2, weights=weight)))
+            text_and_cure = stamps_err(sd_s, mean_s)
+            yield case.found("time_stamps", found.fit, 1, (1e3 * sd_s, 0.0, "ms"), *text_and_cure, raw=found.raw)
     shift = np.broadcast_to(np.eye(2), (len(problem), 2, 2, 2))
     zoom = 0.01 * np.nan_to_num(problem.y - problem.centre_px)[..., None]
     sways = shift, 3.0, 1.0, "px", "image_sways", "shifts", "Fix that camera, and turn off image stabilisation."
