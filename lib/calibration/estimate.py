@@ -70,8 +70,9 @@ def calibrate(
         image_size_px: (width, height); its centre is the principal point of near-affine models, else the detections' centre.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
-    A `NoConsensusError` (a ValueError) is raised if the detections in an image fit no camera, or two cameras that no offsets
-    explain.  A ValueError refuses rows that determine no camera, offsets if too few rows have axes, and what `checks` finds.
+    A `NoConsensusError` (a ValueError) is raised if the detections in an image fit no camera, or two cameras that neither
+    offsets nor a finite distance explain.  A ValueError refuses rows that determine no camera, offsets if too few rows have
+    axes, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
