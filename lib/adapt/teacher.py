@@ -28,7 +28,7 @@ from lib.trust.fitting import SIDES, Problem, Robust
 #: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
 #: wrong, they agree on another point, such as the elbow of a jaw.
 _LEAST_SURE = 0.5
-_STRETCH = 3  # successive frames with exchanged tips that are no chance
+_STRETCH, _SPAN = 3, 10  # this many successive frames with exchanged tips, within so many frames, are no chance
 _FEWEST_SEEN = 20  # fewest detections of a landmark of which a share is judged
 #: Largest share of the frames in which the images may contradict the robot.
 _CONTRADICTED = 0.2
@@ -219,10 +219,10 @@ def teach(
         by_hand: Labels set by hand.  They determine the offsets, since detections may show other points of the tool.
 
     Raises:
-        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; the inliers of a tip have a mean
-            confidence below 0.5; the cameras are not those of a stereo microscope; a landmark is seen more than 15 % of the
-            tool's length and 0.25 mm off; the standard deviation of its label exceeds `NEAR` of the tool's length; or the
-            robot contradicts the images.
+        RefusalError: If fewer than a tenth of the landmarks, or than 30, are inliers; a tip as detected agrees less than a
+            tenth as often as another landmark; the inliers of a tip have a mean confidence below 0.5; the cameras
+            are not those of a stereo microscope; a landmark is seen more than 15 % of the tool's length and 0.25 mm off; the
+            standard deviation of its label exceeds `NEAR` of the tool's length; or the robot contradicts the images.
     """
     alone, seen = seen is None, by_hand if seen is None else seen
     refused = frozen(recording, np.arange(len(recording)))
@@ -263,7 +263,7 @@ def teach(
         offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
-    agrees = shares[0] >= LEAST_RIGHT
+    agrees = not shares[0] < LEAST_RIGHT  # also if it has few detections
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns, agrees)
     if clicked:
         teacher = _as_labelled(teacher, clicks)
@@ -277,17 +277,18 @@ def teach(
         raise RefusalError(
             f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool, or both tips, elsewhere "
             "than the robot reports: a frozen log, another clock, a moved microscope, exchanged tips, or a tool that the "
-            "robot does not hold."
+            f"robot does not hold. If the log is right, the detector errs: {LABEL}"
         )
     return replace(teacher, refused=np.union1d(refused, against))
 
 
 def _shares(rows: Correspondences, inliers: np.ndarray) -> np.ndarray:
-    """(3,) share of inliers among the detections of each landmark, relative to the largest; 1 if there are few detections."""
+    """(3,) share of inliers among the detections of each landmark, relative to the largest; NaN if it has few detections."""
     each = [rows.landmark == k for k in range(len(LANDMARKS))]
     seen = np.array([rows.seen[own].sum() for own in each])
     share = np.array([inliers[own].sum() for own in each]) / np.maximum(seen, 1)
-    return np.where(seen < _FEWEST_SEEN, 1.0, share / max(share.max(), 1e-9))
+    share[seen < _FEWEST_SEEN] = np.nan
+    return share / max(np.nanmax(share, initial=0.0), 1e-9)
 
 
 def _check_tips(recording: Recording, rows: Correspondences, calibration: Calibration, shares: np.ndarray) -> None:
@@ -295,7 +296,7 @@ def _check_tips(recording: Recording, rows: Correspondences, calibration: Calibr
     for k, tip in enumerate(LANDMARKS[1:], 1):  # the base has an end of its own, `Teacher.with_base`
         if shares[k] < LEAST_RIGHT:
             cause = likeliest_fault(recording, rows, None)
-            what = f"in most images {tip} is not where it reports it, although {LANDMARKS[shares.argmax()]} is."
+            what = f"{tip} is hardly ever detected where the robot reports it, but {LANDMARKS[np.nanargmax(shares)]} is."
             cure = f"Check the orientation of the tool and the order of the tips in its log. If these are right: {LABEL}"
             raise RefusalError(f"robot: {f'{cause.text} {cause.cure}' if cause else f'{what} {cure}'}")
         sure = rows.confidence[calibration.view_inliers & (rows.landmark == k)[:, None]]
@@ -361,9 +362,9 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     """The frames in which at least two landmarks are far from the robot's report by the same shift, in both images.
 
-    And stretches in which the tips are exchanged.
-    One image alone may show another object, which the detector takes for the tool.  It only counts if it shows the tool where
-    the robot reports it at another instant: then the two images do not belong together.
+    Stretches with exchanged tips also count.  One image alone may show another object, which the detector takes for the tool.
+    It only counts if it shows the tool where the robot reports it at another instant: then the two images do not belong
+    together.
     """
     free = teacher.calibration.offsets
     if free is not None and free.offset.shape == (3, 3):
@@ -398,7 +399,7 @@ def _exchanged(u: np.ndarray, seen: Seen) -> np.ndarray:
     known = np.flatnonzero(votes >= 2)
     found = np.zeros(len(u), dtype=bool)
     for some in sliding_window_view(known, _STRETCH) if len(known) >= _STRETCH else ():
-        if (against == votes)[some].all():
+        if (against == votes)[some].all() and np.ptp(some) < _SPAN:
             found[some[0] : some[-1] + 1] = True
     return found
 

@@ -32,6 +32,9 @@ _AS_LIKELY = 3.0
 #: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them), or, if negative, as
 #: mirrored images (a curved field may exceed three); step of its derivative.
 _FINITE, _MIRRORED, _STEP_PER_MM = 3.0, 8.0, 1e-6
+#: Largest noise of cameras at a finite distance relative to that of one of two cameras that compete.  It is 0.2 to 1.06 if
+#: they are at such a distance, and 1.17 or more if the microscope zoomed while the tool was moved to another depth.
+_AS_WELL = 1.1
 _LINE = 0.01  # ratio of the singular values of a camera's linear part, below which its image is a line
 
 
@@ -71,8 +74,8 @@ def calibrate(
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
     A `NoConsensusError` (a ValueError) is raised if the detections in an image fit no camera, or two cameras that neither
-    offsets nor a finite distance explain.  A ValueError refuses rows that determine no camera, offsets if too few rows have
-    axes, and what `checks` finds.
+    offsets nor a finite distance (if the model has one) explain.  A ValueError refuses rows that determine no camera, offsets
+    if too few rows have axes, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
@@ -142,8 +145,9 @@ def calibrate_as_shown(
     """`calibrate` with affine cameras, or with cameras at a finite distance if the detections show a significant one.
 
     It is significant if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
-    deviations.  `models` names the affine model and the one with a distance; other options and errors are `calibrate`'s.  If
-    1/distance is negative by eight of them, a warning says that the images look mirrored.
+    deviations; or if the detections agree on two affine cameras, and on one at such a distance.  `models` names the affine
+    model and the one with a distance; other options and errors are `calibrate`'s.  If 1/distance is negative by eight
+    standard deviations, a warning says that the images look mirrored.
 
     >>> from lib.simulator.rig import reference_rig
     >>> rng = np.random.default_rng(0)
@@ -158,9 +162,9 @@ def calibrate_as_shown(
         with suppress(DataError, np.linalg.LinAlgError):
             near = calibrate(data, model=models[1], **options)
             value, sd = near.inverse_distance_per_mm
-            if value > _FINITE * sd:
+            if value > _FINITE * sd and near.reprojection_rms_px < _AS_WELL * np.sqrt(2) * error.sigma_px:
                 return near
-        raise error
+        raise
     state, x = found.minimum.state, found.minimum.work.points
     far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
     with suppress(DataError, np.linalg.LinAlgError):  # too few rows for one more parameter
@@ -262,7 +266,8 @@ def _calibrate(
     if views is None and ransac_px == np.inf:
         views = np.isfinite(y).reshape(n, -1, 2).all(axis=2)
     elif views is None:
-        views, gates = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
+        rng = np.random.default_rng(seed)
+        views, gates = consensus(x, y, ransac_px, rng, sigma_x_mm=sigma_x_mm, near=not plan.is_affine)
     for rows in views.T:
         refuse.check_spread(x[rows], assumed_x)
     claimed = np.eye(m)[None] if noise is None else noise

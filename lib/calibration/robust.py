@@ -28,8 +28,8 @@ _CONTRAST = 8.0
 _LARGEST_NOISE = (0.01, 0.25)
 _TAILS = 0.1  # share of outliers that may still be the tails of the noise; a larger share must be clearly separated
 _LOOSE = 3.0  # factor on the largest noise up to which offsets of the landmarks may be the reason
-#: Rounds of the fit of a camera at a finite distance, and its largest noise relative to that of the camera of some rows.
-_ROUNDS, _ALIKE = 4, 1.5
+#: Rounds of the fit of a camera at a finite distance, and its largest noise relative to that of the first camera of its rows.
+_ROUNDS, _ALIKE = 4, 1.1
 _NEARLY_ALL = 0.8  # if a camera explains more than this share of the rows, a subset may agree better by chance
 
 NO_CONSENSUS_CURE = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
@@ -48,7 +48,11 @@ class LooseCameraError(NoConsensusError):
 
 
 class CompetingCamerasError(NoConsensusError):
-    """Some rows agree on one camera, and as many others on another one."""
+    """Some rows agree on one camera, by `sigma_px`, and as many others on another one."""
+
+    def __init__(self, text: str, sigma_px: float = np.nan) -> None:
+        super().__init__(text)
+        self.sigma_px = sigma_px
 
 
 def gate(n: int) -> float:
@@ -57,19 +61,21 @@ def gate(n: int) -> float:
 
 
 def consensus(
-    x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *, sigma_x_mm: float | None = None
+    x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *, sigma_x_mm: float | None = None,
+    near: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Inlier views (n, cameras) bool of positions x (n, 3) mm and pixels y (n, m), NaN = not seen, and gates (cameras,).
 
     A gate is the squared Mahalanobis distance up to which a row is more probably an inlier than an outlier.  `threshold_px`
     is the largest reprojection error of an inlier; None estimates the noise instead.  Samples thinner than five times the
-    robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says why the rows agree on no camera.
+    robot's accuracy `sigma_x_mm` are not used.  `near`: the cameras may be at a finite distance.  A `NoConsensusError` says
+    why the rows agree on no camera.
     """
     views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
     names, gates = ["u_left", "u_right"] if views.shape[1] == 2 else ["u"], []
     for c, name in enumerate(names):
         rows = np.flatnonzero(views[:, c])
-        found = _one_camera(name, x[rows], y[rows, 2 * c : 2 * c + 2], threshold_px, rng, 5.0 * (sigma_x_mm or 0.0))
+        found = _one_camera(name, x[rows], y[rows, 2 * c : 2 * c + 2], threshold_px, rng, 5.0 * (sigma_x_mm or 0.0), near)
         views[rows, c] = found.keep
         gates.append(found.gate2)
     return views, np.array(gates)
@@ -86,7 +92,7 @@ class _Found(NamedTuple):
 
 
 def _one_camera(
-    name: str, x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
+    name: str, x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float, near: bool
 ) -> _Found:
     """The rows of x (n, 3) and u (n, 2) that agree on a camera; a NoConsensusError if there is none, or more than one."""
     n = len(u)
@@ -120,7 +126,7 @@ def _one_camera(
     beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
     if len(second) < least or other.sigma_px > 3.0 * found.sigma_px or not beside:
         return found
-    if (joint := _at_finite_distance(x, u, np.union1d(first, second), found)) is not None:
+    if near and (joint := _at_finite_distance(x, u, np.union1d(first, second), found)):
         return joint
     early, late = sorted((first, second), key=np.median)
     cut = np.sort(np.concatenate([first, second]))[len(early)]
@@ -129,7 +135,7 @@ def _one_camera(
     else:
         cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are mistaken for each other"
     text = f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
-    raise CompetingCamerasError(text)
+    raise CompetingCamerasError(text, found.sigma_px)
 
 
 def _at_finite_distance(x: np.ndarray, u: np.ndarray, rows: np.ndarray, found: _Found) -> _Found | None:
@@ -141,14 +147,14 @@ def _at_finite_distance(x: np.ndarray, u: np.ndarray, rows: np.ndarray, found: _
     H = np.column_stack([x, np.ones(n)])
     for _ in range(_ROUNDS):
         view = np.cross(*matrix[:, :3])
-        z = (x - x.mean(axis=0)) @ (view / np.linalg.norm(view))
+        z = (x - x.mean(axis=0)) @ (view / max(np.linalg.norm(view), 1e-300))
         of_matrix = np.einsum("ij,nk->nijk", np.eye(2), H).reshape(n, 2, 8)
         D = np.concatenate([of_matrix, (z[:, None] * (centre - u))[..., None]], axis=2)
         beta = np.linalg.lstsq(D[rows].reshape(-1, 9), u[rows].ravel())[0]
         matrix, r2 = beta[:8].reshape(2, 4), ((u - D @ beta) ** 2).sum(axis=1)
     sigma = float(np.sqrt(np.median(r2[rows]) / (2 * np.log(2))))  # of a coordinate
     keep = r2 < gate(n) * sigma**2
-    alike = sigma <= _ALIKE * found.sigma_px and keep[rows].mean() >= _NEARLY_ALL
+    alike = sigma <= _ALIKE * found.sigma_px and keep[rows].mean() >= _NEARLY_ALL and (1.0 + beta[8] * z[keep] > 0).all()
     return _Found(keep, matrix, sigma, np.inf, gate(n)) if alike else None
 
 

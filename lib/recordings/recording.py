@@ -206,9 +206,8 @@ class Recording:
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
         new = np.flatnonzero((moved_mm != 0).any(axis=1))  # NaN is not 0
-        step_mm = np.quantile(jump_mm[new], 0.75) if len(new) > _FEWEST_NEW else 0.0  # of a robot that also rests
-        steps = step_mm > _STEPS * self.robot_accuracy_mm  # else it is a fine grid
-        held_s = float(np.median(np.diff(log_s[new]))) if steps else 0.0
+        large = jump_mm[new[1:]] > _STEPS * self.robot_accuracy_mm  # else the robot rests, or its grid is fine
+        held_s = float(np.median(np.diff(log_s[new])[large])) if large.sum() > _FEWEST_NEW else 0.0
         repeats = held_s > max(_HELD_S, 1.5 * usual_s)
         pauses_s = step[step > 5.0 * usual_s]
         bursts = len(pauses_s) > _FEWEST_NEW and pauses_s.sum() > (1.0 - _BURST_SHARE) * logged

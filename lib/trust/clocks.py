@@ -175,7 +175,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # after lost frames most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
-    shifts = shifts[np.abs(shifts).argsort()]  # where the path is unknown, all are equal
+    shifts = np.array(sorted({0.0, *shifts}, key=abs))  # where the path is unknown, all are equal
     steps_px = np.nan_to_num(np.abs(np.diff(case.by_frame(case.problem.y), axis=0))).max(axis=(1, 3), initial=0.0)
     for views in ((0, 1), (0,), (1,)):
         if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.05:

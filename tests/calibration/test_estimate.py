@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from lib.calibration import (
+    CompetingCamerasError,
     affine_minimum,
     calibrate,
     calibrate_as_shown,
@@ -528,22 +529,37 @@ def test_dlt_refuses_what_it_cannot_solve():
         dlt(x, u[0][:-1])
 
 
-@pytest.mark.parametrize("offset_mm", [0.0, 0.15])
-def test_two_depths_before_a_near_microscope_are_no_two_cameras(offset_mm):
-    """Affine cameras for the near and for the far half differ by 8 % in scale; offsets of the landmarks differ, too."""
-    rng, n = np.random.default_rng(0), 40
-    base = rng.uniform([-4, -2.5, -0.3], [3, 2.5, 0.3], (n, 3)) + np.where(np.arange(n) % 2, 5, 0)[:, None] * [0, 0, 1]
+def at_two_depths(rng, *, distance_mm=np.inf, zoom=1.0, offset_mm=0.0, noise_px=0.4, n=40):
+    """A tool at one depth in the first half of the frames, and 5 mm deeper in the second half, in which the images zoom."""
+    late = np.arange(n) >= n // 2
+    base = rng.uniform([-4, -2.5, -0.3], [3, 2.5, 0.3], (n, 3)) + np.where(late, 5, 0)[:, None] * [0, 0, 1]
     turn = Rotation.from_euler("zyx", rng.normal(0, [0.3, 0.15, 0.3], (n, 3))).as_matrix()
     half = rng.uniform(0.4, 0.8, n)
     tool = np.stack([np.zeros((n, 3)), *(np.column_stack([np.full(n, 3.0), s * half, 0 * half]) for s in (-1, 1))], axis=1)
     x = ROBOT_FROM_MICROSCOPE.apply((base[:, None] + np.einsum("nij,nkj->nki", turn, tool)).reshape(-1, 3))
-    u = [v + rng.normal(0, 0.4, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / 60).project(x)]
+    u, centre = reference_rig(inverse_distance_per_mm=1 / distance_mm).project(x), (np.array(SIZE) - 1) / 2
+    zooms = np.where(np.repeat(late, 3), zoom, 1.0)[:, None]
+    u = [centre + zooms * (v - centre) + rng.normal(0, noise_px, v.shape) for v in u]
     data = Correspondences.of_points(x, *u, frame=np.repeat(np.arange(n), 3), landmark=np.tile(np.arange(3), n))
     offset = offset_mm * np.array([[1, 0.5, -0.5], [-1, 0.5, 0.5], [0.5, -1, 0.7]])
-    data = replace(data, x_mm=x + np.einsum("nij,nj->ni", np.nan_to_num(rows_axes(data)), offset[data.landmark]))
+    return replace(data, x_mm=x + np.einsum("nij,nj->ni", np.nan_to_num(rows_axes(data)), offset[data.landmark]))
+
+
+@pytest.mark.parametrize("offset_mm", [0.0, 0.15])
+def test_two_depths_before_a_near_microscope_are_no_two_cameras(offset_mm):
+    """Affine cameras for both halves differ by 8 % in scale, and offsets of the landmarks make them differ, too."""
+    data = at_two_depths(np.random.default_rng(0), distance_mm=60, offset_mm=offset_mm)
     found = calibrate_as_shown(data)
-    assert found.model == "near_affine" and found.view_inliers.sum() == 6 * n and found.reprojection_rms_px < 0.7
+    assert found.model == "near_affine" and found.view_inliers.all() and found.reprojection_rms_px < 0.7
     assert found.inverse_distance_per_mm[0] == pytest.approx(1 / 62.5, rel=0.02)  # from the middle of the positions
+    with pytest.raises(CompetingCamerasError, match="two consensuses compete"):
+        calibrate(data)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_zoom_before_the_tool_moves_to_another_depth_is_no_finite_distance(seed):
+    with pytest.raises(CompetingCamerasError, match="two consensuses compete"):
+        calibrate_as_shown(at_two_depths(np.random.default_rng(seed), zoom=0.95, noise_px=0.8, n=60), image_size_px=SIZE)
 
 
 def test_cameras_have_a_finite_distance_only_where_the_detections_show_one():

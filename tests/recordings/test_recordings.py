@@ -741,15 +741,20 @@ def test_cells_that_are_left_blank_where_the_robot_was_silent_are_no_doubt(named
 
 @pytest.mark.parametrize(
     ("held", "grid_mm", "trembles_mm", "named"),
-    [(5, 0.0, 0.0, True), (1, 0.0, 0.0, False), (1, 0.02, 0.0, False), (1, 0.5, 0.0, True), (5, 0.0, 0.005, True)],
-)
+    [
+        (5, 0.0, 0.0, True), (1, 0.0, 0.0, False), (1, 0.02, 0.0, False), (1, 0.5, 0.0, True), (5, 0.0, 0.005, True),
+        (1, 0.0, 0.0005, False),
+    ],
+)  # fmt: skip
 def test_a_log_that_repeats_its_positions_is_in_doubt(held, grid_mm, trembles_mm, named):
     """A slow robot and a fast logger, or a coarse grid; a fine one does no harm.  Rests count little, also noisy ones."""
     recording = Recording.open(paths.SHIPPED_RECORDING)
     log = recording.kinematics
     x = log.x_mm.copy()
     if trembles_mm:
-        x[: 2 * len(x) // 3] = x[0] + np.random.default_rng(0).normal(0, trembles_mm, x[: 2 * len(x) // 3].shape)
+        rest = x[: 4 * len(x) // 5]
+        rest[:] = x[0] + np.round(np.random.default_rng(0).normal(0, trembles_mm, rest.shape), 3)  # in steps of 1 um
+        rest[:] = rest[np.arange(len(rest)) // 3 * 3]
     x = x[np.arange(len(x)) // held * held]
     x = np.round(x / grid_mm) * grid_mm if grid_mm else x
     x[100:400] = x[100]
