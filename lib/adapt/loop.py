@@ -418,21 +418,27 @@ class _Work:
         return tuned
 
     def judged(self, first: Seen, best: Detector, best_seen: Seen, teacher: Teacher) -> Adaptation:
-        """Compare both detectors on the frames for judging, which took no part in teaching or stopping."""
+        """Compare both detectors on the frames for judging, which took no part in teaching or stopping.
+
+        Left and right are compared in the frames for stopping, too: only the agreement with the robot chose by these.
+        """
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements = [agreement(teacher, own) for own in seen]
-        unlabelled = np.isnan(agreements[0].distance_px).any(axis=1)  # there a detector may rightly find nothing
-        distances = epipolar_px(self.recording, seen, best_seen.of(self.parts["learn"]))
-        distances = [np.where(unlabelled, np.nan, own) for own in distances]
         length = agreements[0].length_px.mean(axis=1)
         told, spread = teacher.project(self.parts["judge"])
+        untaught = np.union1d(self.parts["stop"], self.parts["judge"])
+        both = first.of(untaught), best_seen.of(untaught)
+        found, judges = agreement(teacher, both[0]), np.isin(untaught, self.parts["judge"])
+        unlabelled = np.isnan(found.distance_px).any(axis=1)  # there a detector may rightly find nothing
+        distances = epipolar_px(self.recording, both, best_seen.of(self.parts["learn"]))
+        distances = [np.where(unlabelled, np.nan, own) for own in distances]
         robot, robot_sd = better(*(own.relative for own in agreements))
-        eye, eye_sd = better(*(frame_means(own / length) for own in distances))
+        eye, eye_sd = better(*(frame_means(own / found.length_px.mean(axis=1)) for own in distances))
         improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and eye > 0
         reasons = {
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than its standard deviation": not robot > _SURE_GAIN * robot_sd,
-            "left and right of the frames for judging, independently of the robot, do not agree better": not eye > 0,
+            "without the robot, left and right of these frames and of those for stopping do not agree better": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
         }
         labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
@@ -446,7 +452,7 @@ class _Work:
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),
             "judged": {
-                name: own.summary() | {"epipolar_px": float(np.nanmedian(distance))}
+                name: own.summary() | {"epipolar_px": float(np.nanmedian(distance[judges]))}
                 for name, own, distance in zip(("before", "after"), agreements, distances, strict=True)
             },
             "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},
