@@ -476,7 +476,20 @@ def turned_back(time_s, x):
     return x[:, :1] + 2 * middle - (x - x[:, :1])
 
 
-ERRING = {"frozen": frozen, "bent": bent, "coarse": coarse, "unturned": unturned, "turned_back": turned_back}
+def exchanged(time_s, x):
+    """The log exchanges the tips from 10 s on."""
+    return np.where((time_s > 10)[:, None, None], x[:, [0, 2, 1]], x)
+
+
+def long_base(time_s, x):
+    """The log's base lies a quarter of the tool's length nearer to the tips."""
+    return np.concatenate([0.75 * x[:, :1] + 0.25 * x[:, 1:].mean(axis=1, keepdims=True), x[:, 1:]], axis=1)
+
+
+ERRING = {
+    "frozen": frozen, "bent": bent, "coarse": coarse, "unturned": unturned, "turned_back": turned_back,
+    "exchanged": exchanged, "long_base": long_base,
+}  # fmt: skip
 
 
 def other_tool(world):
@@ -508,6 +521,10 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
     if fault in ("unturned", "turned_back"):
         told = "always points in the same direction" if fault == "unturned" else "tip_1 is hardly ever detected where"
         assert not tune.calls and told in found.report["reason"]
+    if fault == "long_base":
+        assert not tune.calls and "the base that the robot reports is not where" in found.report["reason"]
+    if fault == "exchanged":
+        assert set(range(21, 24)) <= set(found.report["refused_frames"])
     if fault == "frozen":
         assert set(range(12, 19)) <= set(found.report["refused_frames"])
     if fault == "moved":
