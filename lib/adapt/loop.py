@@ -420,7 +420,7 @@ class _Work:
     def judged(self, first: Seen, best: Detector, best_seen: Seen, teacher: Teacher) -> Adaptation:
         """Compare both detectors on the frames for judging, which took no part in teaching or stopping.
 
-        Left and right are compared in the frames for stopping, too: only the agreement with the robot chose by these.
+        Left and right are compared in the frames for stopping, too: these chose a round by the robot, not by left and right.
         """
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements = [agreement(teacher, own) for own in seen]
@@ -439,7 +439,7 @@ class _Work:
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than its standard deviation": not robot > _SURE_GAIN * robot_sd,
             "without the robot, left and right of these frames and of those for stopping do not agree better": not eye > 0,
-            "the frames for judging agree better with the robot, and left with right": True,
+            "the frames for judging agree better with the robot; left and right do in these and those for stopping": True,
         }
         labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
         unsure = not len(self.marked) and np.nanmax(labels_sd_px) > _UNSURE * np.nanmean(length)

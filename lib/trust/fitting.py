@@ -35,7 +35,7 @@ _LEAST_PX = 0.02  # smaller residuals are rounding errors
 _TRIAL_ROUNDS = 6  # rounds of a fit that only ranks candidate frames
 #: Loss of log likelihood that rules out another frame for a change: errors that depend on the pose made 18 of a true one.
 _SURE_CUT = 25.0
-_ALIKE = 1.0  # difference of the losses of a frame's positions between which nothing decides
+_ALIKE = 1.0  # two positions of a frame whose losses differ by less are equally likely
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # longest step between frames whose positions can replace the robot's log
 _PARAMETERS = 21  # two cameras with one distance (17), and about as many of the nine offsets as the data determine
