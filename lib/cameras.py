@@ -354,10 +354,20 @@ class StereoRig:
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file is never left incomplete."""
-        content = {"format": FORMAT, "units": UNITS}
-        for side, camera in (("left", self.left), ("right", self.right)):
-            content[side] = {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
-        write_json(path, content)
+        write_json(path, {"format": FORMAT, "units": UNITS} | self.to_json())
+
+    def to_json(self) -> dict:
+        """The attributes of both cameras, as `of_json` reads them."""
+        return {
+            side: {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
+            for side, camera in (("left", self.left), ("right", self.right))
+        }
+
+    @classmethod
+    def of_json(cls, content: dict) -> Self:
+        """The rig of `to_json`; another content raises a KeyError, TypeError or ValueError."""
+        sides = content["left"], content["right"]
+        return cls(*((NearAffineCamera if "inverse_distance_per_mm" in own else AffineCamera)(**own) for own in sides))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -370,8 +380,7 @@ class StereoRig:
             for key, expected in (("format", FORMAT), ("units", UNITS)):
                 if content.get(key, expected) != expected:
                     raise ValueError(f"{key} is {content[key]!r}, expected {expected!r}")
-            sides = content["left"], content["right"]
-            rig = cls(*((NearAffineCamera if "inverse_distance_per_mm" in own else AffineCamera)(**own) for own in sides))
+            rig = cls.of_json(content)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"
             raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None

@@ -102,6 +102,7 @@ def main_calibrate(argv: list[str]) -> int:
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
+    numbers |= {"variations": [other.to_json() | _offsets_entries(own) for other, own in calibration.variations]}
     return _done(a, out, "calibration", numbers | _offsets_entries(offsets), verdict)
 
 
@@ -158,10 +159,11 @@ def main_reconstruct(argv: list[str]) -> int:
 def main_register(argv: list[str]) -> int:
     """`python3 -m lib register`: find the calibrated cameras again, after the microscope was moved."""
     a, recording, out = _parsed("register", main_register, argv)
-    rig, (*_, offsets) = StereoRig.load(a.rig), _results_of_rig(a.rig, image_size_px=recording.image_size_px)
+    rig, (*_, offsets, varied) = StereoRig.load(a.rig), _results_of_rig(a.rig, image_size_px=recording.image_size_px)
     data = _data(a, recording)
     seen = with_offsets(data, offsets)
-    found = register_images(rig, seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
+    varied = [(other, with_offsets(data, own)) for other, own in varied]
+    found = register_images(rig, seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust", variations=varied)
     moved, seen = rig.moved(found.transform), seen.complete
     epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
@@ -175,8 +177,9 @@ def main_register(argv: list[str]) -> int:
     numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
     numbers |= {"median_epipolar_px": medians[0], "median_error_mm": medians[1]}
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
-    sd = f"standard deviation {found.translation_sd_mm.max():.3f} mm by these detections alone"
-    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, {sd}, without the calibration's error.")
+    sd = f"standard deviation {found.translation_sd_mm.max():.3f} mm"
+    sd += " with the calibration's error" if varied else " by these detections alone, without the calibration's error"
+    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, {sd}.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where it is expected (median).")
     return _done(a, out, "registration", numbers | _offsets_entries(offsets), verdict)
@@ -192,21 +195,29 @@ def _offsets_entries(offsets: LandmarkOffsets | None) -> dict:
     return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
+def _offsets_of(entries: dict) -> LandmarkOffsets | None:
+    """The offsets of `_offsets_entries`; their standard deviations are not among them."""
+    offset, turns = entries["landmark_offsets_mm"], bool(entries["landmark_offsets_turn_axes"])
+    offset = offset and np.array(offset, dtype=np.float64)
+    return None if offset is None else LandmarkOffsets(offset, np.nan * offset, np.nan, np.nan, turns)
+
+
 def _results_of_rig(
     rig: Path, frame: int = 0, image_size_px: tuple[int, int] | None = None
-) -> tuple[str, Verdict, LandmarkOffsets | None]:
-    """From the result file beside a rig: its recording ("" if not of this frame), its verdict, the landmarks' offsets.
+) -> tuple[str, Verdict, LandmarkOffsets | None, list[tuple[StereoRig, LandmarkOffsets | None]]]:
+    """From the result file beside a rig: its recording ("" if not of this frame), its verdict, offsets, and variations.
 
     A ValueError refuses a rig for images of another size than `image_size_px`, (width, height).
     """
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
     if not path.is_file():
-        return "", Verdict(), None
+        return "", Verdict(), None, []
     try:
         results = json.loads(path.read_text(encoding="utf-8"))
-        offset, turns = results["landmark_offsets_mm"], bool(results["landmark_offsets_turn_axes"])
-        offset = offset and np.array(offset, dtype=np.float64)
-        own = rig.name in ("rig.json", "moved_rig.json") and "recording" in results  # they are not about a refined rig
+        offsets = _offsets_of(results)
+        varied = results.get("variations", []) if rig.name == "rig.json" else []  # they are not about a refined rig
+        varied = [(StereoRig.of_json(one), _offsets_of(one)) for one in varied]
+        own = rig.name in ("rig.json", "moved_rig.json") and "recording" in results
         own = own and frame in range(*results["frames"])
         width, height = results.get("image_size_px", image_size_px or (0, 0))
         folder, verdict = results["recording"] if own else "", Verdict(tuple(Reason(**r) for r in results["reasons"] if own))
@@ -217,7 +228,7 @@ def _results_of_rig(
         what = "the recording has {} x {} px".format(*image_size_px)
         what = f"its cameras are for images of {width} x {height} px, {what}"
         raise ValueError(f"{paths.shown(rig)}: {what}; calibrate with images of this size.")
-    return folder, verdict, None if offset is None else LandmarkOffsets(offset, np.nan * offset, np.nan, np.nan, turns)
+    return folder, verdict, offsets, varied
 
 
 def _common_motion(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:
@@ -296,7 +307,7 @@ def _calibrated(
     """The calibration (None if refused) or the rig of --rig; its landmarks' offsets; the verdict; the landmarks."""
     if given := getattr(a, "rig", None):
         # A wrong rig is refused before the detector takes its time.  Only the frame's landmarks are needed, for the mask.
-        rig, (folder, verdict, offsets) = StereoRig.load(given), _results_of_rig(given, a.frame, recording.image_size_px)
+        rig, (folder, verdict, offsets, _) = StereoRig.load(given), _results_of_rig(given, a.frame, recording.image_size_px)
         data = _data(a, recording, np.array([a.frame]))
         if folder != str(recording.folder.resolve()):
             text = f"{given}: nothing here shows that this rig fits this frame."

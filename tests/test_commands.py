@@ -106,8 +106,15 @@ def test_register_knows_the_offsets_that_the_calibration_removed(tmp_path, monke
     assert commands.main_calibrate([*folder, "--force"]) == 0
     assert np.abs(json.loads((tmp_path / "calibration.json").read_text())["landmark_offsets_mm"]).max() > 0.05
     assert commands.main_register([*folder, "--rig", str(tmp_path / "rig.json")]) == 0
-    moved_mm = float(capsys.readouterr().out.split("moved by ")[1].split(" mm")[0])
+    said = capsys.readouterr().out
+    moved_mm = float(said.split("moved by ")[1].split(" mm")[0])
+    assert "with the calibration's error." in said
     assert moved_mm < 0.03 and "no_common_motion" not in (tmp_path / "registration.json").read_text()
+    told = [json.loads((tmp_path / "registration.json").read_text())]
+    assert commands.main_register([*folder, "--rig", str(tmp_path / "moved_rig.json")]) == 0
+    assert "by these detections alone, without the calibration's error." in capsys.readouterr().out
+    told.append(json.loads((tmp_path / "registration.json").read_text()))
+    assert np.trace(told[0]["covariance"]) > 1.2 * np.trace(told[1]["covariance"])
 
 
 def test_register_writes_no_cameras_under_a_red_verdict(out, tmp_path, capsys):

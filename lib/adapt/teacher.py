@@ -354,8 +354,9 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     names = calibration.parameter_names
     chosen = np.eye(len(names))[[names.index(f"{side} offset {axis} (px)") for side in SIDES for axis in "xy"]]
     minimum = replace(calibration.minimum, state=calibration.minimum.state.moved(shift_sd * found.x[9:] @ chosen))
-    covariance = calibration.parameter_covariance + shift_sd**2 * chosen.T @ np.linalg.inv(information)[9:, 9:] @ chosen
-    calibration = replace(calibration, minimum=minimum, parameter_covariance=covariance)
+    joint = calibration.joint_covariance.copy()
+    joint[: len(names), : len(names)] += shift_sd**2 * chosen.T @ np.linalg.inv(information)[9:, 9:] @ chosen
+    calibration = replace(calibration, minimum=minimum, joint_covariance=joint)
     return replace(teacher, calibration=calibration, offset_mm=offset, offset_covariance_mm2=own)
 
 

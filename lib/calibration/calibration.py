@@ -1,12 +1,13 @@
 """`Calibration`: cameras and their uncertainty; `optics`: the pair's geometry; `OnlineCalibration`: updates by new rows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.checks import extents
+from lib.calibration.models import Model
 from lib.calibration.robust import gate
 from lib.cameras import Camera, StereoRig
 from lib.correspondences import Correspondences
@@ -38,7 +39,7 @@ class Calibration:
 
     Attributes:
         minimum: The fit to the inliers (`lib.calibration.models.fit`).
-        parameter_covariance: (p, p) covariance of the model's parameters.
+        joint_covariance: (q, q) covariance of the model's parameters and, behind them, of the offsets' coordinates.
         view_inliers: (n, cameras) bool: the views used, one row for each row of the data.
         sigma_u_px, sigma_x_mm: Noise levels, given or estimated; with `covariance_px2`, sigma_u_px is its `noise_rms_px`.
         model, weighting, image_size_px: As given to `calibrate`.
@@ -50,10 +51,12 @@ class Calibration:
             pose errs alike in all of them).  The covariances allow for this and for estimated noise.
         detector_scale: Factor, 1 or more, on the detector's standard deviations; `covariance_px2` includes it.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
+        not_shown: (q + 1,) the 1/distance in 1/mm that affine cameras may have without showing it here, one standard
+            deviation, behind the parameters that follow it; None if it was not asked (`calibrate_as_shown` does).
     """
 
     minimum: Minimum
-    parameter_covariance: np.ndarray
+    joint_covariance: np.ndarray
     view_inliers: np.ndarray
     sigma_u_px: float
     sigma_x_mm: float
@@ -67,6 +70,7 @@ class Calibration:
     effective_rows: float
     detector_scale: float
     offsets: LandmarkOffsets | None = None
+    not_shown: np.ndarray | None = None
 
     @property
     def parameter_names(self) -> list[str]:
@@ -94,6 +98,32 @@ class Calibration:
     def cost(self) -> float:
         """The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square)."""
         return self.minimum.energy
+
+    @property
+    def parameter_covariance(self) -> np.ndarray:
+        """(p, p) covariance of the model's parameters."""
+        p = len(self.parameter_names)
+        return self.joint_covariance[:p, :p]
+
+    @property
+    def variations(self) -> list[tuple[StereoRig, LandmarkOffsets | None]]:
+        """Rigs and offsets that differ by one standard deviation along each principal axis of `joint_covariance`.
+
+        The last one differs by the distance that is `not_shown`.  The squared differences of what is computed from them add
+        up to its variance.
+        """
+        _ = self.pair  # a ValueError refuses a single camera
+        values, vectors = np.linalg.eigh(self.joint_covariance)
+        p, q, learnt, found = len(self.parameter_names), len(values), self.offsets, []
+        steps = [*(vectors * np.sqrt(np.maximum(values, 0.0))).T, *([] if self.not_shown is None else [self.not_shown])]
+        for step in steps:
+            state = self.minimum.state.moved(step[:p])
+            if len(step) > q:
+                near = Model.parse(f"{self.model}+distance", len(self.cameras))
+                state = replace(state, model=near, rho=state.rho + step[q])
+            offsets = learnt and replace(learnt, offset=learnt.offset + step[p:q].reshape(learnt.offset.shape))
+            found.append((StereoRig(*state.cameras()), offsets))
+        return found
 
     @property
     def covariance(self) -> np.ndarray:

@@ -32,6 +32,7 @@ _AS_LIKELY = 3.0
 #: Standard deviations of 1/distance that count as a finite distance (1 of 2000 affine rigs exceeds them), or, if negative, as
 #: mirrored images (a curved field may exceed three); step of its derivative.
 _FINITE, _MIRRORED, _STEP_PER_MM = 3.0, 8.0, 1e-6
+_USUAL_PER_MM = 1e-2  # standard deviation of 1/distance before any data: few microscopes are nearer than 100 mm
 #: Largest noise of cameras at a finite distance relative to that of one of two cameras that compete.  It is 0.2 to 1.06 if
 #: they are at such a distance, and 1.17 or more if the microscope zoomed while the tool was moved to another depth.
 _AS_WELL = 1.1
@@ -120,7 +121,7 @@ def calibrate(
             J_x, J, weight, r = found.system
             order = () if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
             known, effective = sandwich(J, weight, r, J_x, *order)
-            found = replace(found, parameter_covariance=known, effective_rows=effective)
+            found = replace(found, joint_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, rows.frame, prior_sd=offset_prior_sd)
         found = estimate(axes=axes)
@@ -168,9 +169,11 @@ def calibrate_as_shown(
     state, x = found.minimum.state, found.minimum.work.points
     far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
     with suppress(DataError, np.linalg.LinAlgError):  # too few rows for one more parameter
-        value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
+        value, sd, follow = further_step(found, data, (near - far) / _STEP_PER_MM)
         if value > _FINITE * sd:
             return calibrate(data, model=models[1], **options)
+        known = _USUAL_PER_MM**2 / (_USUAL_PER_MM**2 + sd**2)
+        found = replace(found, not_shown=np.hypot(known * value, np.sqrt(known) * sd) * np.append(follow, 1.0))
         if value < -_MIRRORED * sd:
             what = "farther things look larger, so the images look mirrored, and depths would have the wrong sign"
             warnings.warn(f"u_left, u_right: {what}; flip both images, or use a right-handed robot frame.", stacklevel=2)
@@ -291,16 +294,16 @@ def _calibrate(
     if (narrowest < _LINE * widest).any():
         what = "the camera that agrees best shows all positions on a line"
         raise NoConsensusError(f"u: no consensus, {what}; {NO_CONSENSUS_CURE}.")
-    parameter_covariance = inverse(minimum.information)
+    covariance = inverse(minimum.information)
     if weighting == "paper":  # its weights are not the inverse noise covariances: the sandwich H^-1 G H^-1
         variance_u, variance_x = paper_variances(sigma_u, sigma_x)
         _, J_x, J_c = minimum.state.evaluate(minimum.work.points)
         outer = J_x @ J_x.mT
         WJ = precision(variance_u * np.eye(m) + variance_x * outer, views[inliers]) @ J_c
         G = np.einsum("nip,nij,njq->pq", WJ, scale**2 * claimed + sigma_x**2 * outer, WJ)
-        parameter_covariance = parameter_covariance @ G @ parameter_covariance
+        covariance = covariance @ G @ covariance
     found = Calibration(
-        minimum=minimum, parameter_covariance=parameter_covariance, view_inliers=views, sigma_u_px=sigma_u,
+        minimum=minimum, joint_covariance=covariance, view_inliers=views, sigma_u_px=sigma_u,
         sigma_x_mm=sigma_x, residuals_px=residuals, model=model, weighting=weighting, x_mm=x, y_px=y,
         image_size_px=None if image_size_px is None else tuple(image_size_px), effective_rows=float(inliers.sum()),
         covariance_px2=None if noise is None else scale**2 * noise, detector_scale=1.0 if noise is None else scale,

@@ -290,7 +290,7 @@ def _steps(
     if score is not None:  # correlated errors count less
         p_value = float(chdtrc(score[0], score[1] * effective / len(r))) if score[0] else 1.0
     learnt = LandmarkOffsets(offset, sd, prior_sd, p_value)
-    return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
+    return replace(found, joint_covariance=full, effective_rows=effective, offsets=learnt)
 
 
 def _without_cameras(J: np.ndarray, J_c: np.ndarray, weight: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -397,20 +397,26 @@ def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tu
     return float(candidates[np.argmax(evidence)]), (int(known.sum()), float((along[known] / values[known]).sum()))
 
 
-def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float]:
+def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Estimates one more parameter, 0 so far, of the calibration `found` of `data`: its value and standard deviation.
 
     One Gauss-Newton step in it, cameras and offsets together; `column` (inliers, m) is the derivative of the pixels by it.
+    The third result (q,) is how the parameters of `joint_covariance` follow it.
     """
     rows, learnt = data.subset(found.inliers), found.offsets
     J_x, J_c, weight, r = found.system
-    J, now, prior = column[:, :, None], np.zeros(1), np.zeros(1)
-    if learnt is not None and learnt.offset.shape[1] == 3:
-        axes = np.nan_to_num(rows_axes(data, learnt.offset if learnt.turns else None)[found.inliers])
-        of_offsets = np.einsum("nia,nk->nika", J_x @ axes, np.eye(len(learnt.offset))[rows.landmark]).reshape(*r.shape, -1)
-        J, now = np.concatenate([J, of_offsets], axis=2), np.append(now, learnt.offset)
-        prior = np.append(prior, np.full(learnt.offset.size, learnt.prior_sd**-2))
-    information, gradient = _without_cameras(J, J_c, weight, r)
-    step = np.linalg.solve(information + np.diag(prior), gradient - prior * now)[0]
-    J, prior = np.concatenate([J, J_c], axis=2), np.diag(np.append(prior, np.zeros(J_c.shape[2])))
-    return float(step), float(np.sqrt(sandwich(J, weight, r, J_x, rows.frame, rows.landmark, prior)[0][0, 0]))
+    parts, now, prior = [J_c, column[:, :, None]], np.zeros(J_c.shape[2] + 1), np.zeros(J_c.shape[2] + 1)
+    if learnt is not None:
+        own = np.eye(r.shape[1])[None]
+        if learnt.offset.shape[1] == 3:
+            own = J_x @ np.nan_to_num(rows_axes(data, learnt.offset if learnt.turns else None)[found.inliers])
+        by_offset = own[:, :, None] * np.eye(len(learnt.offset))[rows.landmark][:, None, :, None]
+        parts.insert(1, by_offset.reshape(*r.shape, -1))
+        now = np.insert(now, -1, learnt.offset.ravel())
+        prior = np.insert(prior, -1, np.full(learnt.offset.size, learnt.prior_sd**-2))
+    J = np.concatenate(parts, axis=2)
+    weighted = (weight @ J).reshape(-1, J.shape[2])
+    information = weighted.T @ J.reshape(weighted.shape) + np.diag(prior)
+    step = np.linalg.solve(information, weighted.T @ r.ravel() - prior * now)[-1]
+    sd = np.sqrt(sandwich(J, weight, r, J_x, rows.frame, rows.landmark, np.diag(prior))[0][-1, -1])
+    return float(step), float(sd), -np.linalg.solve(information[:-1, :-1], information[:-1, -1])

@@ -234,7 +234,7 @@ def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematic
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
     if np.count_nonzero(v.any(axis=1)) < 8:
         return 0.0, np.inf
-    return further_step(found, data, (found.system[0] @ v[:, :, None])[:, :, 0])
+    return further_step(found, data, (found.system[0] @ v[:, :, None])[:, :, 0])[:2]
 
 
 def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:

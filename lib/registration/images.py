@@ -6,6 +6,7 @@ cameras see u = project(S x); a small rotation and shift of S x change u by J [-
 """
 
 import warnings
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -32,6 +33,7 @@ Loss = Literal["squared", "robust"]
 def register_images(
     rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
     covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0, loss: Loss = "squared",
+    variations: Sequence[tuple[StereoRig, Correspondences]] = (),
 ) -> Registration:  # fmt: skip
     """The motion of a rig whose cameras moved together; it maps points of the old rig to the robot frame.
 
@@ -45,6 +47,8 @@ def register_images(
             correspondences; if they have none, the noise is equal in all pixels and estimated from the residuals.
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
         loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
+        variations: The calibration's uncertainty: other rigs, each with the correspondences after its own `with_offsets`
+            (`Calibration.variations`).  Without them, the covariance is due to the errors of these detections alone.
 
     A ValueError refuses arrays of different lengths, and landmarks that do not determine the motion.  A warning says that
     a rotation is uncertain by more than 5 degrees (standard deviation), as in a single frame with shut jaws: then it may be
@@ -56,7 +60,8 @@ def register_images(
     >>> register_images(rig, x + [0.2, 0.1, 0.5], *rig.project(x)).transform.t.round(6).tolist()
     [0.2, 0.1, 0.5]
     """
-    found = _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
+    observed = _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm)
+    found = _register_both(rig, replace(observed, variations=variations), loss)
     sd_rad = np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])
     if sd_rad > _UNSURE_RAD:
         what = f"the rotation about an axis has a standard deviation of {np.rad2deg(sd_rad):.0f} degrees, so it may be wrong"
@@ -125,7 +130,7 @@ def identify_motion(
 class _Observed:
     """Reported positions x (n, 3) mm, pixels y (n, 4), their covariance (n or 1, 4, 4), and the images to use (n, 2) bool.
 
-    `moves`: True for the left and for the right camera if it has the unknown motion.
+    `moves`: True for the left and for the right camera if it has the unknown motion.  `variations`: other rigs and rows.
     """
 
     x: np.ndarray
@@ -134,6 +139,7 @@ class _Observed:
     seen: np.ndarray
     scale_known: bool
     moves: tuple[bool, bool] = (True, True)
+    variations: Sequence[tuple[StereoRig, Correspondences]] = ()
 
     @classmethod
     def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> Self:
@@ -238,7 +244,7 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         return RigidTransform(turn @ stale.R, turn @ (stale.t - centre) + centre + step[3:])
 
     found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters, tolerance=1e-11)
-    information, (_, distance2, weights) = found.information, found.work
+    information, (residual, distance2, weights) = found.information, found.work
     if np.linalg.matrix_rank(information, tol=_UNDETERMINED * np.trace(information), hermitian=True) < parameters:
         cure = "Add frames in other positions." if data.seen.any(axis=0).all() else "Both cameras must see the tool."
         raise ValueError(f"x_mm, u_left, u_right: these landmarks do not determine the motion. {cure}")
@@ -255,6 +261,11 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         indefinite = np.linalg.eigvalsh(hessian)[-parameters] <= _UNDETERMINED * np.trace(information)
         own = sandwich(information if indefinite else hessian, gradient[used], parameters * n / size)
     covariance = (_STATED_ROWS * covariance + n * own) / (_STATED_ROWS + n)
+    for other, own in data.variations:  # the step that another rig, with its offsets, would cause
+        x = np.where(np.isfinite(own.x_mm), own.x_mm, data.x)
+        change = np.nan_to_num(own.stacked_px) - np.hstack(other.project(found.state.apply(x))) - residual
+        step = np.linalg.lstsq(information, gradients(found.state, (change, distance2, weights))[1].sum(axis=0))[0]
+        covariance = covariance + np.outer(step, step)
     motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
     distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])

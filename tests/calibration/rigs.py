@@ -28,14 +28,17 @@ def near_rig(distance_mm=200.0, radial=0.0):
     )
 
 
-def tool_sweep(seed, *, frames=75, turn_rad=0.4, offset_mm=OFFSETS_MM, distance_mm=np.inf, sigma_px=0.8):
+def tool_sweep(
+    seed, *, frames=75, turn_rad=0.4, offset_mm=OFFSETS_MM, distance_mm=np.inf, sigma_px=0.8, span_mm=(6, 3, 1.2),
+    motion=None,
+):  # fmt: skip
     """Correspondences of a turning tool whose landmarks are seen beside their report, the true rig, true positions (n, 3)."""
     rng = np.random.default_rng(seed)
-    rig = near_rig(distance_mm)
+    rig = near_rig(distance_mm) if motion is None else near_rig(distance_mm).moved(motion)
     poses = [
         ROBOT_FROM_MICROSCOPE.compose(
             RigidTransform.from_rotation_vector(
-                turn_rad * rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3) * [6, 3, 1.2] - [2, 0, 0]
+                turn_rad * rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3) * span_mm - [2, 0, 0]
             )
         )
         for _ in range(frames)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
+from lib.calibration import calibrate_as_shown, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import MIN_CONFIDENCE, Correspondences
 from lib.geometry import RigidTransform
@@ -34,6 +35,7 @@ from notebooks.studies.moved_cameras import (
     simulated_errors,
     tool_frames,
 )
+from tests.calibration.rigs import tool_sweep
 
 CENTRE_MM = ROBOT_FROM_MICROSCOPE.t
 RIG = reference_rig()
@@ -216,6 +218,25 @@ def test_robust_covariances_of_few_rows_hold():
         fit = register_images(RIG, *data, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM, loss="robust")
         scores.append(mahalanobis2(fit, motion))
     assert 4.6 < np.mean(scores) < 7.4
+
+
+@pytest.mark.parametrize("distance_mm", [np.inf, 400.0, 150.0])
+def test_covariances_allow_for_the_calibration_with_its_offsets_and_an_unknown_distance(distance_mm):
+    """Calibrated from a tool that hardly moves; then the microscope moves so far that it sees the tool along other rays."""
+    scores = {"alone": [], "with calibration": []}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        how = {"distance_mm": distance_mm, "offset_mm": rng.normal(0, 0.03, (3, 3)), "span_mm": (1.2, 1.0, 0.5)}
+        found = calibrate_as_shown(tool_sweep(seed, frames=40, **how)[0])
+        motion = random_motion(rng, centre_mm=CENTRE_MM, translation_mm=5.0)
+        later = tool_sweep(seed + 500, frames=20, motion=motion, **how)[0]
+        varied = [(rig, with_offsets(later, offsets)) for rig, offsets in found.variations]
+        seen = with_offsets(later, found.offsets)
+        for name, variations in (("alone", ()), ("with calibration", varied)):
+            fit = register_images(found.rig, seen, covariance_px2=0.64, sigma_x_mm=0.01, variations=variations)
+            scores[name].append(mahalanobis2(fit, motion))
+    assert 4.0 < np.mean(scores["with calibration"]) < 8.5  # 6; at 400 mm it is 23 if an unknown distance is taken for none
+    assert np.mean(scores["alone"]) > 50
 
 
 def test_covariance_at_grows_with_distance():
