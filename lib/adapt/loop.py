@@ -13,7 +13,17 @@ import numpy as np
 
 from lib import files, paths
 from lib.adapt.candidates import choose
-from lib.adapt.judging import Agreement, agreement, base_apart, better, epipolar_px, frame_means, sd_share, stretches
+from lib.adapt.judging import (
+    CONFIRMED,
+    Agreement,
+    agreement,
+    better,
+    check_base,
+    epipolar_px,
+    frame_means,
+    sd_share,
+    stretches,
+)
 from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.adapt.teacher import LABEL, OtherBaseError, RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
@@ -32,7 +42,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 38  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 39  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -55,12 +65,7 @@ _GUIDED, _SETTLED = 3, 0.01
 _ANGLED = np.cos(np.radians(12.0))  # the jaws are angled if the cosine between shaft and tips is smaller
 _OVERRULE = 5  # fewest labelled pairs that overrule the detector
 _UNSURE = 0.01  # standard deviation of the robot's labels, as a share of the tool's length, above which it asks for clicks
-#: Shares of the tool's length: the largest standard deviation of a landmark that no label set by hand gives, and if the
-#: detector marks another point than the base, the largest distance between the base that was found and the shaft's end.
-_VAGUE, _CONFIRMED = 0.05, 0.03
-#: Largest distance, as a share of the tool's length, of the base in whole images from the label.  It was up to 0.06 in 24
-#: recordings of unfamiliar tools; the robots erred by up to 0.3 mm.
-_APART = 0.1
+_VAGUE = 0.05  # largest standard deviation of a landmark that no label set by hand gives, as a share of the tool's length
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
@@ -265,7 +270,7 @@ class _Work:
                 raise RefusalError(f"detector: with the robot it gives {what}. {LABEL}")
             self.shaft = shaft_end(recording, learn, u[:, :, 0], teacher.axes_px(learn))
             doubted = not (self.knows_base and teacher.agrees_on_base)
-            if doubted and (self.shaft is None or abs(self.shaft.moved) > _CONFIRMED):
+            if doubted and (self.shaft is None or abs(self.shaft.moved) > CONFIRMED):
                 base = "the robot reports" if self.knows_base else "was searched instead, at these angled jaws,"
                 what = f"it marks another point than the base, and the base that {base}"
                 raise RefusalError(f"detector: {what} is not where the aligned frames show the end of the shaft. {LABEL}")
@@ -274,12 +279,8 @@ class _Work:
             self.report["base_moved_mm"] = 0.0 if self.shaft is None else float(shift_mm @ self.shaft.axis)
             aside = self.shaft and self.shaft.aside
             self.report["base_moved_aside_mm"] = 0.0 if aside is None else float(shift_mm @ aside.axis)
-            # A detector that looks near the robot's base may follow the robot, whatever is there.
-            whole = self.whole.of(np.setdiff1d(learn, teacher.refused))
-            if self.looks_near and self.knows_base and abs(apart := base_apart(teacher, whole)) > _APART:
-                what = f"in whole images it sees the base {100 * abs(apart):.0f} % of the tool's length from where robot and"
-                what += " images place it. It marks another point there, or the robot's tool has other dimensions"
-                raise RefusalError(f"detector: {what}. {LABEL}")
+            if self.looks_near and self.knows_base:
+                check_base(teacher, self.whole.of(np.setdiff1d(learn, teacher.refused)), self.shaft)
         self.report["refused_frames"] = teacher.refused
         agreement(teacher, first.of(parts["judge"]), fewest=3)  # else training is in vain
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
@@ -335,21 +336,23 @@ class _Work:
             return teacher
 
     def with_any_base(self, seen: Seen, by_hand: Seen | None, name: str = "base") -> Teacher:
-        """A first teacher.  The detector may mark the kink of angled jaws instead of the base.
+        """A first teacher.  The detector may mark the kink of angled jaws, or a ring on the shaft, instead of the base.
 
         Then the tips alone give the cameras, and the base is detected near the robot's; `name` is that of these detections.
         """
         try:
             return teach(self.recording, seen, by_hand=by_hand)
-        except OtherBaseError as refused:
-            if not self.looks_near:
+        except RefusalError as refused:
+            if not self.looks_near or by_hand is not None:
                 raise
             try:
                 tips = teach(self.recording, seen._replace(confidence=seen.confidence * [0.0, 1.0, 1.0]))
                 near = self.near(name, self.detector, seen.frame, tips)
-                teacher = teach(self.recording, seen.with_base(near), by_hand=by_hand)
+                teacher = teach(self.recording, seen.with_base(near))
             except RefusalError:
                 raise refused from None
+            if not isinstance(refused, OtherBaseError):
+                return replace(teacher, agrees_on_base=False)
             if self.axis[0] > _ANGLED:
                 raise
             self.knows_base = False

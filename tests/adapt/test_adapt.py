@@ -325,6 +325,32 @@ def test_a_base_that_only_follows_the_robot_teaches_nothing(world, tmp_path, mon
     assert ("in whole images it sees the base" if shift else "training starts") in found.report["reason"]
 
 
+@pytest.mark.parametrize(
+    ("rings", "taught_at", "shaft_ends", "reason"),
+    [
+        (15, 0.0, 0.0, ""),
+        (15, 0.0, None, "in whole images it sees the base 28 %"),
+        (15, 0.0, -0.28, "the end of the shaft, it sees the base 28 %"),
+        (10, -0.08, 0.08, "the end of the shaft, it sees the base 7 %"),  # the median of the detections is near this base
+        (10, -0.08, None, ""),  # which may be the robot's
+    ],
+)
+def test_the_measured_end_of_the_shaft_decides_between_two_edges(rings, taught_at, shaft_ends, reason):
+    """In `rings` of 25 frames the detector marks a ring on the shaft, 28 % of the tool's length behind its end."""
+    tool = np.array([[0.0, 0], [100, -20], [100, 20]])
+    u = np.tile(tool, (25, 2, 1, 1))
+    u[:rings, :, 0, 0] -= 28.0
+    seen = Seen(np.arange(25), u, np.tile(np.eye(2), (25, 2, 3, 1, 1)), np.ones((25, 2, 3)))
+    base = tool[0] + [100 * taught_at, 0]
+    known = SimpleNamespace(project=lambda frames: (np.tile([base, *tool[1:]], (len(frames), 2, 1, 1)), None))
+    end = None
+    if shaft_ends is not None:
+        at = np.tile(base + [100 * shaft_ends, 0], (25, 2, 1))
+        end = ShaftEnd(seen.frame, at, np.array([1.0, 0, 0]), np.full((25, 2, 2), np.nan), shaft_ends, 0.01, None, None)
+    with pytest.raises(RefusalError, match=reason) if reason else nullcontext():
+        judging.check_base(known, seen, end)
+
+
 def test_jaws_that_are_nearly_shut_keep_their_roll(world, recording, monkeypatch):
     """Robot and teacher disagree on the tips by 0.06 mm, which turns the axes of nearly shut jaws by far."""
     time_s = np.arange(0, 12, 0.02)
