@@ -31,7 +31,7 @@ _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and le
 AS_GOOD = 6.0
 _SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (16 numbers) whose frames are examined
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
-_UNFIT_SHARE = 0.2  # least share of gross errors in the landmarks of an unfit detector; fewer do no harm
+_UNFIT_SHARE, _UNFIT_ONE = 0.2, 0.35  # least share of gross errors of an unfit detector: in all landmarks, or in one
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
@@ -259,9 +259,14 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         explained = (share if off is far else 1.0) * (1.0 - (epipolar / missed) ** 2)
         gain = float(gain if off is far else half * np.log(missed / epipolar) / fit.design)
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
-    if off is not far:
-        return []
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where the cameras see them."
+    if off is not far:
+        each = [problem.used & (problem.landmark == k)[:, None] for k in range(len(LANDMARKS))]
+        wrong = [far[own].sum() / max(own.sum(), 1) for own in each]
+        if max(wrong) < _UNFIT_ONE:
+            return []
+        what = f"{100 * max(wrong):.0f} % of the detections of {LANDMARKS[int(np.argmax(wrong))]}"
+        text = f"{what} lie more than 5 % of the tool's length from where the cameras see it."
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
 
 

@@ -238,6 +238,19 @@ def test_an_image_that_one_camera_lost_is_named():
     assert best.name == "frame_order" and "of the right images" in best.text and "+67 ms from those stated" in best.text
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.45, True), (0.2, False)])
+def test_a_base_that_is_often_marked_elsewhere_is_told(share, told):
+    """At a ring on the shaft, 28 % of the tool's length behind its end: the cameras hardly suffer, but the user should know."""
+    usual = take(frames=60)
+    u_left, u_right = usual.data.grid("u_left"), usual.data.grid("u_right")
+    for u in (u_left, u_right):
+        elsewhere = np.random.default_rng(0).random(60) < share
+        u[elsewhere, 0] -= 0.28 * (u[:, 1:].mean(axis=1) - u[:, 0])[elsewhere]
+    marked = replace(usual.data, u_left=u_left.reshape(-1, 2), u_right=u_right.reshape(-1, 2))
+    best = found(replace(usual, data=marked)).best
+    assert told == (best is not None and best.name == "detector_unfit" and "of the detections of base lie" in best.text)
+
+
 def test_the_cure_of_a_lens_that_distorts_mends_it():
     spoiled = take("lens distorts", "10 %")
     model = re.search(r"--model (\S+)`", found(spoiled).best.cure)[1]
