@@ -84,6 +84,11 @@ def test_where_nothing_is_calibrated_times_that_are_wrong_come_first(folder, det
         calibrated = replace(found.assessment, calibration=object(), diagnosis=SimpleNamespace(best=best), verdict=red)
         assert (module._next(late, calibrated, None) == late.mistimed) == first
         assert module._next(recording, calibrated, None) == "Flip it."
+    off = SimpleNamespace(name="landmark_offset", cure="Robot or detector errs.")
+    of_base = Reason("base", LEVELS[1], "", "Let the robot teach.")
+    behind = Verdict((Reason("landmark_offset", LEVELS[2], "", off.cure), of_base))
+    known = replace(found.assessment, calibration=object(), diagnosis=SimpleNamespace(best=off), verdict=behind)
+    assert module._next(recording, known, None) == "Let the robot teach."
 
 
 def test_the_next_step_names_the_weights_that_were_given(folder, detector, tmp_path, monkeypatch, capsys):

@@ -240,7 +240,7 @@ def test_an_image_that_one_camera_lost_is_named():
 
 @pytest.mark.parametrize(("share", "told"), [(0.45, True), (0.2, False)])
 def test_a_base_that_is_often_marked_elsewhere_is_told(share, told):
-    """At a ring on the shaft, 28 % of the tool's length behind its end: the cameras hardly suffer, but the user should know."""
+    """At a ring on the shaft, 28 % of the tool's length behind its end.  The cameras hardly suffer from it."""
     usual = take(frames=60)
     u_left, u_right = usual.data.grid("u_left"), usual.data.grid("u_right")
     for u in (u_left, u_right):
