@@ -1,7 +1,9 @@
 """Turns the files of other programs into a recording.  All of them are checked first, and it appears whole or not at all."""
 
+import re
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from decimal import Decimal
 from functools import partial
@@ -43,7 +45,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         raise ValueError(f"{out}: holds your files, and --overwrite replaces all of it; choose another --out.")
     spec = read_mapping(mapping)
     stereo = open_stereo(folder, spec.video)
-    robot_time, *reported = read_robot(folder, spec)
+    robot_time, *reported = read_robot(folder, spec, notes := list(stereo.notes))
     # Subtract the first whole second of times that count from a date, and of times of day unless both tables have such.
     of_day = [table is not None and table.time_unit == "hms" for table in (spec.video.table, spec.robot)]
     starts = [stereo.time[0], robot_time[0]]
@@ -69,7 +71,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         if (all(zeros) or all(of_day)) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
             hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
             cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
-        cure = f"Set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
+        cure = f"If the log is of the same run, set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
         raise ValueError(f"{folder / spec.robot.file}: {what}. {cure}.")
     if estimated:  # the search starts where they overlap; times are rounded to 1e-7 s
         offset_s = float(np.clip(offset_s, least + 1e-6, most - 1e-6))
@@ -99,12 +101,19 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             clock, found = _clock(draft, spec.robot.search_s, zero_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
+                if abs(clock.offset_s - offset_s) > search_s:
+                    notes.append(f"It is beyond search_s = {search_s:g}: wherever log and video overlap was searched.")
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            report = {"format": "microstereo.import", "did": _did(spec, stereo, draft, clock, zeros), "clock": found}
+            elif clock:
+                what = f"the offset of the clocks was not found; offset_s = {offset_s:g} is a guess"
+                warnings.warn(f"{out}: {what}. State robot.offset_s in {mapping}, or correct it there.", stacklevel=2)
+            did = _did(spec, stereo, draft, clock, zeros, notes)
+            report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # names the temporary folder of the unfinished recording, which no longer exists
         text = str(error).replace(str(writer.folder / "recording.toml"), str(mapping))
+        text = text.replace(f"{writer.folder / 'kinematics.csv'}: ", f"{folder / spec.robot.file}, read with {mapping}: ")
         raise ValueError(text.replace(str(writer.folder), str(out))) from None
     return report
 
@@ -112,8 +121,9 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset | str:
     """Estimate the clock offset from labels, or from detections if there are none.
 
-    Returns the reason as a string if the detector does not know the tool, and log and video do overlap.  Errors state
-    offsets between the times in the files, which are larger than offsets of the draft by `zero_s`.
+    If no offset within `search_s` explains them, all offsets with which log and video overlap are searched.  Returns the
+    reason as a string if the detector does not know the tool, and log and video do overlap.  Errors state offsets between the
+    times in the files, which are larger than offsets of the draft by `zero_s`.
     """
     if (labels := draft.annotations) is not None:
         known = {"u_left": labels.u_left, "u_right": labels.u_right}
@@ -124,16 +134,26 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
         seen = detect(replace(draft, readout_s=0.0), SharedDetector(), frames=some)  # readout 0 keeps the pixels
         known = {name: seen.grid(name) for name in ("u_left", "u_right", "covariance_px2", "confidence")} | {"frames": some}
     paired = partial(of_recording, **known)
-    try:
-        found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
-    except ValueError as error:
+    least, most = (draft.kinematics.time_s[end] - draft.frames.time_s[-1 - end] for end in (0, -1))
+    searches = [(draft.offset_s, search_s), ((least + most) / 2, (most - least) / 2)]  # middle and half width
+    failures: list[ValueError] = []
+    for start_s, reach_s in searches[: 1 + (least < draft.offset_s - search_s or draft.offset_s + search_s < most)]:
+        try:
+            found = estimate_time_offset(paired(draft), draft.kinematics, start_s=start_s, search_s=reach_s)
+            break
+        except ValueError as error:
+            failures.append(error)
+    else:
+        error = failures[0]
         said = {doubt.name: f"{doubt.text} {doubt.cure}" for doubt in draft.doubts if doubt.is_of_time}
         wrong = said.pop("little_overlap", None)  # at the offset where the search began, so that it had to find another
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError) and not wrong:
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
-        what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
-        cure = " ".join(["Or give a number: t_robot = t_video + offset_s.", *said.values()])
+        what = re.sub(r" \(`[^`]*`\)|; widen search_s", "", str(error).split(": ", 1)[-1])  # there is no recording to check
+        what = what.replace("search_s", "robot.search_s")
+        tried = f"No other offset from {zero_s + least:.3f} to {zero_s + most:.3f} s fits. " if failures[1:] else ""
+        cure = " ".join([f"{tried}Give a number: t_robot = t_video + offset_s.", *said.values()])
         raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
     with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))
@@ -164,6 +184,15 @@ def _landmarks(
     return x, {kind: dict(zip(spec.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
 
 
+@contextmanager
+def _told_of(key: str, cure: str) -> Iterator[None]:
+    """Let errors name a key of the mapping, and its cure, in place of an argument."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{key}: {str(error).split(': ', 1)[-1]} {cure}") from None
+
+
 def _tool(
     spec: Mapping, poses: list[RigidTransform], robot_s: np.ndarray, opening: np.ndarray | None, frames_s: np.ndarray,
     labels: Annotations | None, zero_s: float,
@@ -179,13 +208,17 @@ def _tool(
         at, u = frames_s[inside], [side[inside] for side in (labels.u_left, labels.u_right)]
         turns = Slerp(robot_s, Rotation.from_matrix([pose.R for pose in poses]))(at).as_matrix()
         jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
-        found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)], u, **jaws)
+        at_frames = [RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)]
+        cure = "Is offset_s right? Else give tool.hinge, or tool.landmarks_mm."
+        with _told_of(f"tool.estimate, with robot.offset_s = {spec.robot.offset_s:g}", cure):
+            found = tool_offsets(at_frames, u, **jaws)
         return found, np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     offset = np.array([tool.landmarks_mm.get(name, (np.nan, np.nan, np.nan)) for name in names])
     sd = np.zeros_like(offset)
     for name, span_s in tool.pivot_s.items():
         k, (low, high) = names.index(name), np.subtract(span_s, zero_s)
-        pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
+        with _told_of(f"tool.pivot_s.{name}", "Name other times, or give tool.landmarks_mm."):
+            pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
         offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
     hinged = tool.hinge is not None and any(turning)
     if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
@@ -197,18 +230,20 @@ def _tool(
 
 
 def _did(
-    spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
-) -> list[str]:
+    spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal],
+    notes: list[str],
+) -> list[str]:  # fmt: skip
     """Render did.txt: the steps of the import, one sentence or more in each line."""
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
     return Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
-        spec=spec, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
+        spec=spec, stereo=stereo, draft=draft, clock=clock, notes=notes,
+        span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
         zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],
-        zero_s=float(zeros[0] - zeros[1]) if all(zeros) else 0.0,
+        in_mapping_s=round(Decimal(draft.offset_s), 7) + zeros[1] - zeros[0], both_dated=all(zeros),
         silent=np.isnan(draft.landmarks_mm()).all(axis=(1, 2)).sum(),
         labelled=tuple((visibility > 0).any(axis=1).sum() for visibility in seen),
     ).rstrip().split("\n")  # fmt: skip

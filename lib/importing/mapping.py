@@ -1,9 +1,11 @@
 """The mapping file of an import: where the data are in the source, in which units and under which names."""
 
+from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from lib.correspondences import LANDMARKS
 from lib.recordings.tables import read_toml
@@ -12,6 +14,12 @@ Vector = tuple[float, float, float]
 Columns = tuple[str, str, str]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # because it is shown in web pages and terminals
+
+
+def _number_or_estimate(value: object) -> object:
+    with suppress(TypeError, ValueError):
+        return value if value == "estimate" else float(value)
+    raise ValueError('a number of seconds is needed, or the word "estimate"')
 
 
 class _Section(BaseModel):
@@ -85,7 +93,7 @@ class Robot(Table):
     length_unit: Literal["m", "cm", "mm", "um"]
     landmarks: dict[Name, Columns] | None = None
     pose: Pose | None = None
-    offset_s: float | Literal["estimate"] = 0.0
+    offset_s: Annotated[float | Literal["estimate"], BeforeValidator(_number_or_estimate)] = 0.0
     search_s: Annotated[float, Field(gt=0)] = 0.5
     frame: Frame = Frame()
 
@@ -95,7 +103,8 @@ class Robot(Table):
         columns = [self.time, *(column for landmark in (self.landmarks or {}).values() for column in landmark)]
         columns += [*self.pose.position, *self.pose.rotation, self.pose.gripper] if self.pose else []
         if twice := next((column for column in columns if columns.count(column) > 1), ""):
-            raise ValueError(f"the column {twice!r} is named twice; the time, each axis and each landmark have their own")
+            cure = "the time, each axis and each landmark have their own; pivot a table whose rows hold one landmark each"
+            raise ValueError(f"the column {twice!r} is named twice; {cure}")
 
 
 class Hinge(_Section):
@@ -172,8 +181,14 @@ def read_mapping(path: str | Path) -> Mapping:
     try:
         return Mapping.model_validate(read_toml(path))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
+        errors = error.errors(include_url=False, include_context=False)
+        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
         key, text = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
         value = f" = {text}" if len(text) < 60 and first["type"] != "missing" else ""
         text = first["msg"].removeprefix("Value error, ").removesuffix(".")
+        if first["type"] == "extra_forbidden":
+            schema = Mapping.model_json_schema()
+            known = {name for part in (schema, *schema["$defs"].values()) for name in part.get("properties", {})}
+            near = get_close_matches(str(first["loc"][-1]), sorted(known), 1)
+            text = f"no such key here; the nearest one is {near[0]}" if near else "no such key here"
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None
