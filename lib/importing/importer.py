@@ -2,8 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from decimal import Decimal
 from functools import partial
@@ -102,12 +101,13 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 if abs(clock.offset_s - offset_s) > search_s:
-                    notes.append(f"It is beyond search_s = {search_s:g}: wherever log and video overlap was searched.")
+                    what = "all with which log and video overlap were tried"
+                    notes.append(f"The clock offset lies beyond search_s = {search_s:g}: {what}.")
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
             elif clock:
                 what = f"the offset of the clocks was not found; offset_s = {offset_s:g} is a guess"
                 warnings.warn(f"{out}: {what}. State robot.offset_s in {mapping}, or correct it there.", stacklevel=2)
-            did = _did(spec, stereo, draft, clock, zeros, notes)
+            did = [*_did(spec, stereo, draft, clock, zeros), *notes]
             report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
@@ -135,9 +135,8 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
         known = {name: seen.grid(name) for name in ("u_left", "u_right", "covariance_px2", "confidence")} | {"frames": some}
     paired = partial(of_recording, **known)
     least, most = (draft.kinematics.time_s[end] - draft.frames.time_s[-1 - end] for end in (0, -1))
-    searches = [(draft.offset_s, search_s), ((least + most) / 2, (most - least) / 2)]  # middle and half width
     failures: list[ValueError] = []
-    for start_s, reach_s in searches[: 1 + (least < draft.offset_s - search_s or draft.offset_s + search_s < most)]:
+    for start_s, reach_s in ((draft.offset_s, search_s), ((least + most) / 2, (most - least) / 2)):
         try:
             found = estimate_time_offset(paired(draft), draft.kinematics, start_s=start_s, search_s=reach_s)
             break
@@ -152,8 +151,8 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
         what = re.sub(r" \(`[^`]*`\)|; widen search_s", "", str(error).split(": ", 1)[-1])  # there is no recording to check
         what = what.replace("search_s", "robot.search_s")
-        tried = f"No other offset from {zero_s + least:.3f} to {zero_s + most:.3f} s fits. " if failures[1:] else ""
-        cure = " ".join([f"{tried}Give a number: t_robot = t_video + offset_s.", *said.values()])
+        tried = f"No offset from {zero_s + least:.3f} to {zero_s + most:.3f} s fits"
+        cure = " ".join([f"{tried}. Give a number: t_robot = t_video + offset_s.", *said.values()])
         raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
     with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))
@@ -177,20 +176,16 @@ def _landmarks(
         raise ValueError(f"robot.pose: {what}. Name other columns of {spec.robot.file}, or log the rotation.")
     poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
     opening = None if opening is None else opening[known]
-    tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    try:
+        tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    except ValueError as error:  # `tool_offsets` and `pivot_calibration` name their own arguments
+        key = f"tool.estimate, with offset_s = {spec.robot.offset_s}" if spec.tool.estimate else "tool.pivot_s"
+        cure = "Check offset_s and the times, or give tool.hinge or tool.landmarks_mm."
+        raise ValueError(re.sub(r"^(robot_from_tool|opening_rad|u):(.*)", rf"{key}:\2 {cure}", str(error))) from None
     x = np.full((len(known), len(spec.landmarks), 3), np.nan)
     x[known] = tool.positions_mm(poses, opening)
     kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm, "sd_mm": sd}
     return x, {kind: dict(zip(spec.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
-
-
-@contextmanager
-def _told_of(key: str, cure: str) -> Iterator[None]:
-    """Let errors name a key of the mapping, and its cure, in place of an argument."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{key}: {str(error).split(': ', 1)[-1]} {cure}") from None
 
 
 def _tool(
@@ -208,17 +203,13 @@ def _tool(
         at, u = frames_s[inside], [side[inside] for side in (labels.u_left, labels.u_right)]
         turns = Slerp(robot_s, Rotation.from_matrix([pose.R for pose in poses]))(at).as_matrix()
         jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
-        at_frames = [RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)]
-        cure = "Is offset_s right? Else give tool.hinge, or tool.landmarks_mm."
-        with _told_of(f"tool.estimate, with robot.offset_s = {spec.robot.offset_s:g}", cure):
-            found = tool_offsets(at_frames, u, **jaws)
+        found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)], u, **jaws)
         return found, np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     offset = np.array([tool.landmarks_mm.get(name, (np.nan, np.nan, np.nan)) for name in names])
     sd = np.zeros_like(offset)
     for name, span_s in tool.pivot_s.items():
         k, (low, high) = names.index(name), np.subtract(span_s, zero_s)
-        with _told_of(f"tool.pivot_s.{name}", "Name other times, or give tool.landmarks_mm."):
-            pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
+        pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
         offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
     hinged = tool.hinge is not None and any(turning)
     if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
@@ -230,16 +221,14 @@ def _tool(
 
 
 def _did(
-    spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal],
-    notes: list[str],
-) -> list[str]:  # fmt: skip
+    spec: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
+) -> list[str]:
     """Render did.txt: the steps of the import, one sentence or more in each line."""
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
     return Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
-        spec=spec, stereo=stereo, draft=draft, clock=clock, notes=notes,
-        span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
+        spec=spec, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
         zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],

@@ -23,7 +23,6 @@ _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this 
 _ROUNDED = 0.25  # share of the rows that repeat the time before, from which on they count as rounded
 _DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
-_NO_TABLE = {".json", ".jsonl", ".npy", ".npz", ".mat", ".h5", ".hdf5", ".parquet", ".xls", ".xlsx"}
 _FAR = 10.0  # a value that recurs in all coordinates is no position if it is farther off than so many ranges of the others
 
 
@@ -86,7 +85,7 @@ def uncommented(text: str, separator: str = "") -> list[str]:
     if header := next((line for line in reversed(lines[:first]) if line.strip()), "").lstrip(" \t#%"):
         names, cells = (line.split(separator or separator_of(bare[first])) for line in (header, bare[first]))
         row = re.match(r'[\s"]*[-+]?\.?\d', cells[0])
-        numbers = [name for name in names if re.fullmatch(r'[\s"]*[-+\d.eE]*\d[\s"]*', name)]
+        numbers = [name for name in names if re.fullmatch(r'[\s"]*[-+]?\.?\d[-+\d.eE]*[\s"]*', name)]
         if row and len(names) == len(cells) and not numbers:
             bare[first - 1] = header
     filled = [i for i, line in enumerate(bare) if line.strip()][:2]
@@ -104,7 +103,7 @@ def separator_of(line: str) -> str:
 
 
 def text_of(path: Path) -> tuple[str, bool]:
-    """The text of a file in UTF-8, UTF-16 with a byte order mark, or Windows-1252 (of Excel), and whether it is the last."""
+    """The text of a file in UTF-8, UTF-16 with a byte order mark, or else Windows-1252; and True if it is the last one."""
     try:
         return decoded(path, utf_16=True), False
     except ValueError as refused:
@@ -122,9 +121,8 @@ def read_columns(
     """
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
-    if path.suffix.lower() in _NO_TABLE:
-        cure = "Convert it to CSV, one row for each time"
-        raise ValueError(f"{path}: no CSV table and no ROS bag, the two kinds of files that are read here. {cure}.")
+    if path.suffix.lower() in (".json", ".jsonl", ".npy", ".npz", ".mat", ".h5", ".parquet", ".xls", ".xlsx"):
+        raise ValueError(f"{path}: only CSV tables and ROS bags are read here. Convert it to CSV, one row for each time.")
     wanted = [table.time, *names]
     text, by_excel = text_of(path)
     notes += [f"{path.name} is not UTF-8 and was read as Windows-1252."] * by_excel
@@ -241,7 +239,7 @@ def read_robot(
         notes.append(f"{path.name}: {len(rows) - len(new)} rows that repeat the row before were left out.")
         time, places, columns = [time[i] for i in new], [places[i] for i in new], {n: x[new] for n, x in columns.items()}
     increasing(time, str(path), _STEP_S, "time_unit", places)
-    _blank_sentinels(path, columns, groups, notes)
+    _blank_sentinels(columns, groups, notes)
     if empty := [name for name in names if np.isnan(columns[name]).all()]:
         raise ValueError(f"{path}: no row has a value in {', '.join(empty)}. Name other columns, or fewer landmarks.")
     x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
@@ -264,14 +262,11 @@ def read_robot(
     return time, x, R, _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
 
 
-def _blank_sentinels(
-    path: Path, columns: dict[str, np.ndarray], groups: Sequence[Sequence[str]], notes: list[str]
-) -> None:
+def _blank_sentinels(columns: dict[str, np.ndarray], groups: Sequence[Sequence[str]], notes: list[str]) -> None:
     """Blank, in `columns`, numbers that stand for "no report": they recur in all three coordinates of a position at once.
 
     Such a number is far from all other positions, or it is 0 and they move by less than their distance from 0.
     """
-    counts: dict[float, int] = {}
     beside = columns.keys() - {name for group in groups for name in group}  # the rotation and the gripper of a pose
     for group in groups:
         x = np.stack([columns[name] for name in group], axis=-1)
@@ -281,11 +276,9 @@ def _blank_sentinels(
             rows = alike & (x[:, 0] == value)
             distance = float(np.linalg.norm(others - value, axis=1).min())
             if rows.sum() > 1 and distance > (_FAR if value else 1.0) * np.ptp(others, axis=0).max() > 0:
-                counts[value] = counts.get(value, 0) + int(rows.sum())
                 for name in (*group, *(beside if value else ())):
                     columns[name][rows & (columns[name] == value)] = np.nan
-    for value, count in counts.items():
-        notes.append(f"{path.name}: {value:g} in all coordinates of {count} positions was taken for no report.")
+                notes.append(f"{value:g} in {', '.join(group)} was taken for no report, in {rows.sum()} rows.")
 
 
 def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ class _Images:
             if one == other:
                 raise ValueError(f"{later}: has the same number as {path.name}. Narrow the pattern to one camera.")
         self.stamps, exif = None, _orientation(self.files[0])
-        self.turned = f"has the EXIF orientation {exif}" if exif != 1 else ""
+        self.turned = f"has the EXIF orientation {exif}" if exif > 1 else ""
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
         counted &= len(set(map(int, seconds))) < 2
         self.numbers = {path.stem: n for n, path in enumerate(self.files)}
@@ -83,7 +83,7 @@ class _Images:
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
         for path in (self.files[index] for index in wanted):
             image = read_image(path, bit_depth=None)
-            if _orientation(path) != 1:  # then OpenCV turns it
+            if _orientation(path) > 1:  # then OpenCV turns it
                 image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
             yield image
 
@@ -234,9 +234,7 @@ def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
     return [(own - (min(first) if together else own[0])) // usual for own in numbers]
 
 
-def _times(
-    folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray, notes: list[str]
-) -> list[Decimal]:
+def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray, notes: list[str]) -> list[Decimal]:
     if video.times == "fps":
         return [Decimal(int(place)) / Decimal(str(video.fps)) for place in places]
     if video.times == "names" and reel.stamps is None:

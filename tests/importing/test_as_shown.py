@@ -123,7 +123,7 @@ def test_a_number_that_stands_for_no_report_leaves_a_gap(value, few, tmp_path):
 
     x_mm = logs.read_robot(tmp_path, read_mapping(log_of(tmp_path, few, change)), notes := [])[1]
     assert np.argwhere(np.isnan(x_mm).any(axis=2)).tolist() == [[7, 1], [30, 1], [31, 1]]
-    assert notes == [f"log.csv: {value} in all coordinates of 3 positions was taken for no report."]
+    assert notes == [f"{value} in tip_1_x, tip_1_y, tip_1_z was taken for no report, in 3 rows."]
 
 
 @pytest.mark.parametrize("rest", [[5.0, 5.0, 5.0], [0.0, 0.0, 0.0], [40.0, 40.0, 40.0]])

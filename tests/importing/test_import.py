@@ -625,7 +625,7 @@ def test_a_clock_beyond_its_search_is_found_elsewhere_in_the_log(late_s, shipped
     did = import_recording(folder, mapping, tmp_path / "eye")["did"]
     zero, offset_s = int(late.robot_s[0]) if late_s > 1e6 else 0, Recording.open(tmp_path / "eye").offset_s
     assert abs(offset_s + zero - late_s) < 5e-4
-    assert "It is beyond search_s = 0.5: wherever log and video overlap was searched." in did
+    assert "The clock offset lies beyond search_s = 0.5: all with which log and video overlap were tried." in did
     told = f"offset_s is {offset_s:.4f} in recording.toml; in a mapping it would be {offset_s + zero:.4f}, since"
     assert any(line.startswith(told) for line in did) == (late_s > 1e6)
 
@@ -635,7 +635,7 @@ def test_a_clock_that_no_offset_explains_is_refused_with_what_was_searched(shipp
     folder, mapping = source_of(tmp_path, few, foreign.images, foreign.robot_csv, foreign.labels_coco)
     mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
     low, high = (shipped.robot_s[end] - shipped.time_s[-1 - end] for end in (0, -1))
-    text = f"^robot.offset_s, searched from -0.500 to 0.500 s: .* No other offset from {low:.3f} to {high:.3f} s fits. Give"
+    text = f"^robot.offset_s, searched from -0.500 to 0.500 s: .* No offset from {low:.3f} to {high:.3f} s fits. Give"
     with pytest.raises(ValueError, match=re.sub(r"([.+])(?!\*)", r"\\\1", text)):
         import_recording(folder, mapping, tmp_path / "eye")
 

@@ -245,7 +245,7 @@ SPOILT = {
     "rounded times": (rounded_times, r"log\.csv, line \d: the time repeats .* rounded to 1 s\. .*more digits; .*spread"),
     "empty log": (edit("log.csv", lambda t: t.splitlines()[0] + "\n"), r"log\.csv: the table has no row"),
     "not UTF-8": (bytes_of("log.csv", b"time_s,\x81\n"), r"log\.csv, line 1: the text is not UTF-8"),
-    "JSON lines": (told("log.csv", "log.jsonl"), r"log\.jsonl: no CSV table and no ROS bag.* Convert it to CSV, one row"),
+    "JSON lines": (told("log.csv", "log.jsonl"), r"log\.jsonl: only CSV tables and ROS bags .* Convert it to CSV, one row"),
     "metres called mm": (edit("log.csv", lambda t: _scaled(t, 1e-3)), r"log\.csv.*length_unit"),
     "mm called metres": (told('length_unit = "mm"', 'length_unit = "m"'), r"log\.csv.*moves over .* mm.*length_unit"),
     "ms called s": (edit("log.csv", lambda t: _scaled(t, 1e3, times=True)), r"log\.csv: entries are 400 s apart.*time_unit"),
@@ -326,7 +326,7 @@ SPOILT = {
         r"the position of base, tip_1, tip_2 in the tool frame is not given; give tool\.landmarks_mm"),
     "a jaw along its hinge": (pose(tool=HINGE.replace("axis = [0, 0, 1]", "axis = [1, 0, 0]")),
         r"the jaw lies along the axis"),
-    "jaws that never open": (shut, r"tool\.estimate, with robot\.offset_s = 1\.7e\+09: "
+    "jaws that never open": (shut, r"tool\.estimate, with offset_s = 1700000000\.0: "
         r"the jaws open by only 0 rad, which does not determine the hinge"),
 }  # fmt: skip
 
