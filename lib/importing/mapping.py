@@ -1,11 +1,10 @@
 """The mapping file of an import: where the data are in the source, in which units and under which names."""
 
-from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lib.correspondences import LANDMARKS
 from lib.recordings.tables import read_toml
@@ -14,12 +13,6 @@ Vector = tuple[float, float, float]
 Columns = tuple[str, str, str]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # because it is shown in web pages and terminals
-
-
-def _number_or_estimate(value: object) -> object:
-    with suppress(TypeError, ValueError):
-        return value if value == "estimate" else float(value)
-    raise ValueError('a number of seconds is needed, or the word "estimate"')
 
 
 class _Section(BaseModel):
@@ -93,7 +86,7 @@ class Robot(Table):
     length_unit: Literal["m", "cm", "mm", "um"]
     landmarks: dict[Name, Columns] | None = None
     pose: Pose | None = None
-    offset_s: Annotated[float | Literal["estimate"], BeforeValidator(_number_or_estimate)] = 0.0
+    offset_s: float | Literal["estimate"] = 0.0
     search_s: Annotated[float, Field(gt=0)] = 0.5
     frame: Frame = Frame()
 
@@ -183,12 +176,15 @@ def read_mapping(path: str | Path) -> Mapping:
     except ValidationError as error:
         errors = error.errors(include_url=False, include_context=False)
         first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-        key, text = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
+        *parts, last = first["loc"] or ("the mapping",)
+        parts += [] if last == "float" else [last]  # only offset_s takes a number or a word
+        key, text = ".".join(map(str, parts)), repr(first["input"])
         value = f" = {text}" if len(text) < 60 and first["type"] != "missing" else ""
         text = first["msg"].removeprefix("Value error, ").removesuffix(".")
+        text = 'a number of seconds is needed, or the word "estimate"' if last == "float" else text
         if first["type"] == "extra_forbidden":
             schema = Mapping.model_json_schema()
             known = {name for part in (schema, *schema["$defs"].values()) for name in part.get("properties", {})}
-            near = get_close_matches(str(first["loc"][-1]), sorted(known), 1)
+            near = get_close_matches(str(last), sorted(known), 1)
             text = f"no such key here; the nearest one is {near[0]}" if near else "no such key here"
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None
