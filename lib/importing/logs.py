@@ -321,7 +321,8 @@ def _rotations(places: list[str], pose: Pose, values: np.ndarray, notes: list[st
         valid = np.abs(length / usual - 1) < 1e-2
         if abs(usual - 1) > 1e-2:
             notes.append(f"The quaternions in {', '.join(pose.rotation)} have the length {usual:.4g}; they were normalised.")
-        why = f" (lengths vary from {length.min():.4g} to {length.max():.4g})" if not valid.all() else ""
+        if not valid.all():
+            why = f" (lengths vary from {length.min():.4g} to {length.max():.4g}; if the columns are right, normalise them)"
         made = partial(Rotation.from_quat, scalar_first=kind == "quaternion_wxyz")
     else:
         degrees = kind == "euler_xyz_deg"

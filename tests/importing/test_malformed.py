@@ -314,7 +314,7 @@ SPOILT = {
     "unfit rotations": (pose(old='"px", "py", "pz"]\nrotation = ["qw"', new='"qw", "py", "pz"]\nrotation = ["px"'),
         r"pose\.tsv, line 2: columns px, qx, .* are no quaternion_wxyz: -?[\d.]+, .*\. Check rotation_kind"),
     "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0 "
-        r"\(lengths vary from 1 to 2\)\. Check rot"),
+        r"\(lengths vary from 1 to 2; .* normalise them\)\. Check rot"),
     "a tip elsewhere": (edit("log.csv", lambda t: _scaled(t, 100, column=4)),
         r"log\.csv, read with .*map\.toml: the median distances from base are \d+ to tip_1, [23]\.\d+ to tip_2, "
         r"not plausible in mm \(0\.25 to 100\)\. Check the columns of tip_1\."),
