@@ -196,7 +196,8 @@ def estimate_time_offset(
             # The log's noise adds to the velocities.  That part seems to determine the offset, but does not.
             noise = paths.velocity_sd[landmark] ** 2 @ np.broadcast_to(np.einsum("kia,nij,kja->n", A, W, A), len(time))
             if information <= _MOTION * noise:
-                raise DataError("kinematics: the tool hardly moves, or at constant velocity; no offset can be estimated.")
+                what = "within search_s the tool hardly moves, or at constant velocity, so no offset can be estimated"
+                raise DataError(f"kinematics: {what}; widen search_s.")
             step = np.einsum("ni,nij,nj->", derivative, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:

@@ -16,17 +16,18 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
-from lib.importing.logs import separator_of, topics_of, uncommented
+from lib.importing.logs import separator_of, text_of, topics_of, uncommented
 from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
-from lib.recordings.tables import decoded, read_toml
+from lib.recordings.tables import read_toml
 
 _LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
-_TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
+_TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|zeit|temps|tiempo|tempo|tijd|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
 _ROTATION = re.compile(r"(?i)(^|[ _.\-])r$")  # of rx, ry, rz
 _NO_POINT = re.compile(r"(?i)(^|[ _.\-])([vwf]|vel\w*|speed|acc\w*|force|torque)$")  # of vx, vy, vz and the like
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
 _NUMBERED = re.compile(r"^(.*?)[ _.\[(]*\d[ _.,\[\]()]*\d?[\])]?$")
+_CURE = "Convert the robot's log to CSV: one row for each time, and three columns for each landmark"
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
 
 
@@ -43,7 +44,7 @@ def guess_mapping(source: str | Path) -> str:
             tables[name] = _table(paths[name])
         except (ValueError, csv.Error) as error:  # it may be notes in another encoding
             refused = error
-    robot = _robot(folder, paths, tables, refused)
+    robot = _robot(folder, paths, {name: table for name, table in tables.items() if _is_log(*table)}, refused)
     estimate = "pose" in robot and bool(labels)
     robot["offset_s"] = 0.0 if estimate else "estimate"
     hinge = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}  # zeros are refused until measured
@@ -72,8 +73,7 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
         with av.open(str(paths[films[0]])) as container:
             stream = container.streams.video[0]
             layout = "top_bottom" if stream.width < 1.1 * stream.height else "side_by_side"
-            times = _frame_times(tables, stream.frames) or {"times": "container"}
-        return {"layout": layout, "file": films[0], **times, "exchanged": False}
+        return {"layout": layout, "file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
     kinds = Counter((Path(name).parent / f"*{Path(name).suffix}").as_posix() for name in images)
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
     if not names:
@@ -81,7 +81,7 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
     names = names if len(names) > 1 else _sides(folder, names[0])
     left, *rights = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
-    times = {"times": "container"}
+    times = _film_times(folder / left, tables) if films else {}
     seconds = [] if films else decimals(list(folder.glob(left)))
     if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else numbers: cam_1.0001 is frame 1
         times = {"times": "names", "name_unit": "s"}
@@ -91,6 +91,11 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
         times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}
     views = {"layout": "two", "left": left, "right": rights[0]} if rights else {"layout": "side_by_side", "file": left}
     return {**views, **times, "exchanged": False}
+
+
+def _film_times(film: Path, tables: dict[str, tuple]) -> dict:
+    with av.open(str(film)) as container:
+        return _frame_times(tables, container.streams.video[0].frames) or {"times": "container"}
 
 
 def _sides(folder: Path, pattern: str) -> list[str]:
@@ -115,7 +120,7 @@ def _frame_times(tables: dict[str, tuple], frames: int) -> dict:
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark of a table, and the cells of each column."""
-    lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()] or [","]
+    lines = [line for line in uncommented(text_of(path)[0]) if line.strip()] or [","]
     separator = separator_of(lines[0])
     if separator == " " and lines[0].count(" ") != lines[-1].count(" "):  # the name of a single column
         separator = ","
@@ -123,6 +128,12 @@ def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
     columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}
     return {"separator": separator, "decimal": decimal}, columns
+
+
+def _is_log(dialect: dict[str, str], columns: dict[str, list[str]]) -> bool:
+    """Whether a table has columns for times and three coordinates, which notes and other tables lack."""
+    numeric = [np.isfinite(_numbers(cells, dialect["decimal"])).any() for cells in columns.values()]
+    return len(numeric) > 3 and sum(numeric) >= 3
 
 
 def _numbers(cells: list[str], decimal: str) -> np.ndarray:
@@ -147,10 +158,16 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
     if bags := [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]:
         return _bag(folder, bags[0].rpartition("/")[0] if (folder / bags[0]).with_name("metadata.yaml").exists() else bags[0])
     if not tables:
-        raise refused or FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
+        others = [name for name, path in paths.items() if path.suffix.lower() not in (*VIDEOS, *IMAGES)]
+        what = "no log of a robot in it: no ROS bag, and no table (.csv, .tsv, .txt) with three columns of numbers"
+        raise refused or FileNotFoundError(f"{folder}: {what}. It has {', '.join(others) or 'no other files'}. {_CURE}.")
     name = max(tables, key=lambda name: paths[name].stat().st_size)
     dialect, columns = tables[name]
     time = _time(columns, dialect["decimal"], _LOG_STEP_S)
+    cells = columns[time["time"]]
+    if 2 * len(set(cells)) < len(cells):
+        what = f"{len(cells)} rows have only {len(set(cells))} times in {time['time']!r}; pivot it if rows hold one landmark"
+        raise ValueError(f"{paths[name]}: {what}. {_CURE}.")
     turn = _rotation(columns, dialect["decimal"])
     groups: dict[str, dict[str, str]] = {}
     for column in columns:

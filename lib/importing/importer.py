@@ -1,5 +1,6 @@
 """Turns the files of other programs into a recording.  All of them are checked first, and it appears whole or not at all."""
 
+import re
 import warnings
 from contextlib import suppress
 from dataclasses import replace
@@ -43,7 +44,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         raise ValueError(f"{out}: holds your files, and --overwrite replaces all of it; choose another --out.")
     spec = read_mapping(mapping)
     stereo = open_stereo(folder, spec.video)
-    robot_time, *reported = read_robot(folder, spec)
+    robot_time, *reported = read_robot(folder, spec, notes := list(stereo.notes))
     # Subtract the first whole second of times that count from a date, and of times of day unless both tables have such.
     of_day = [table is not None and table.time_unit == "hms" for table in (spec.video.table, spec.robot)]
     starts = [stereo.time[0], robot_time[0]]
@@ -69,7 +70,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         if (all(zeros) or all(of_day)) and low <= 1800 * half_hours and 0 < abs(half_hours) <= 28:
             hours = f"{half_hours / 2:+g} hour{'s' * (abs(half_hours) != 2)}"
             cure += f". Is a time zone of {hours} between them? Then offset_s = {1800 * half_hours}"
-        cure = f"Set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
+        cure = f"If the log is of the same run, set robot.offset_s (now {spec.robot.offset_s!r}) in {mapping} to {cure}"
         raise ValueError(f"{folder / spec.robot.file}: {what}. {cure}.")
     if estimated:  # the search starts where they overlap; times are rounded to 1e-7 s
         offset_s = float(np.clip(offset_s, least + 1e-6, most - 1e-6))
@@ -99,12 +100,20 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             clock, found = _clock(draft, spec.robot.search_s, zero_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
+                if abs(clock.offset_s - offset_s) > search_s:
+                    what = "all with which log and video overlap were tried"
+                    notes.append(f"The clock offset lies beyond search_s = {search_s:g}: {what}.")
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            report = {"format": "microstereo.import", "did": _did(spec, stereo, draft, clock, zeros), "clock": found}
+            elif clock:
+                what = f"the offset of the clocks was not found; offset_s = {offset_s:g} is a guess"
+                warnings.warn(f"{out}: {what}. State robot.offset_s in {mapping}, or correct it there.", stacklevel=2)
+            did = [*_did(spec, stereo, draft, clock, zeros), *notes]
+            report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool, "mapping": spec.model_dump(mode="json"), "sources": _sources(folder, spec, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # names the temporary folder of the unfinished recording, which no longer exists
         text = str(error).replace(str(writer.folder / "recording.toml"), str(mapping))
+        text = text.replace(f"{writer.folder / 'kinematics.csv'}: ", f"{folder / spec.robot.file}, read with {mapping}: ")
         raise ValueError(text.replace(str(writer.folder), str(out))) from None
     return report
 
@@ -112,8 +121,9 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset | str:
     """Estimate the clock offset from labels, or from detections if there are none.
 
-    Returns the reason as a string if the detector does not know the tool, and log and video do overlap.  Errors state
-    offsets between the times in the files, which are larger than offsets of the draft by `zero_s`.
+    If no offset within `search_s` explains them, all offsets with which log and video overlap are searched.  Returns the
+    reason as a string if the detector does not know the tool, and log and video do overlap.  Errors state offsets between the
+    times in the files, which are larger than offsets of the draft by `zero_s`.
     """
     if (labels := draft.annotations) is not None:
         known = {"u_left": labels.u_left, "u_right": labels.u_right}
@@ -124,16 +134,25 @@ def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset
         seen = detect(replace(draft, readout_s=0.0), SharedDetector(), frames=some)  # readout 0 keeps the pixels
         known = {name: seen.grid(name) for name in ("u_left", "u_right", "covariance_px2", "confidence")} | {"frames": some}
     paired = partial(of_recording, **known)
-    try:
-        found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
-    except ValueError as error:
+    least, most = (draft.kinematics.time_s[end] - draft.frames.time_s[-1 - end] for end in (0, -1))
+    failures: list[ValueError] = []
+    for start_s, reach_s in ((draft.offset_s, search_s), ((least + most) / 2, (most - least) / 2)):
+        try:
+            found = estimate_time_offset(paired(draft), draft.kinematics, start_s=start_s, search_s=reach_s)
+            break
+        except ValueError as error:
+            failures.append(error)
+    else:
+        error = failures[0]
         said = {doubt.name: f"{doubt.text} {doubt.cure}" for doubt in draft.doubts if doubt.is_of_time}
         wrong = said.pop("little_overlap", None)  # at the offset where the search began, so that it had to find another
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError) and not wrong:
             return str(error).removesuffix(".")
         low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
-        what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
-        cure = " ".join(["Or give a number: t_robot = t_video + offset_s.", *said.values()])
+        what = re.sub(r" \(`[^`]*`\)|; widen search_s", "", str(error).split(": ", 1)[-1])  # there is no recording to check
+        what = what.replace("search_s", "robot.search_s")
+        tried = f"No offset from {zero_s + least:.3f} to {zero_s + most:.3f} s fits"
+        cure = " ".join([f"{tried}. Give a number: t_robot = t_video + offset_s.", *said.values()])
         raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}") from None
     with suppress(DataError, np.linalg.LinAlgError):  # a full calibration needs more data
         data = paired(replace(draft, offset_s=found.offset_s))
@@ -157,7 +176,12 @@ def _landmarks(
         raise ValueError(f"robot.pose: {what}. Name other columns of {spec.robot.file}, or log the rotation.")
     poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
     opening = None if opening is None else opening[known]
-    tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    try:
+        tool, sd = _tool(spec, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    except ValueError as error:  # `tool_offsets` and `pivot_calibration` name their own arguments
+        key = f"tool.estimate, with offset_s = {spec.robot.offset_s}" if spec.tool.estimate else "tool.pivot_s"
+        cure = "Check offset_s and the times, or give tool.hinge or tool.landmarks_mm."
+        raise ValueError(re.sub(r"^(robot_from_tool|opening_rad|u):(.*)", rf"{key}:\2 {cure}", str(error))) from None
     x = np.full((len(known), len(spec.landmarks), 3), np.nan)
     x[known] = tool.positions_mm(poses, opening)
     kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm, "sd_mm": sd}
@@ -208,7 +232,7 @@ def _did(
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
         zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],
-        zero_s=float(zeros[0] - zeros[1]) if all(zeros) else 0.0,
+        in_mapping_s=round(Decimal(draft.offset_s), 7) + zeros[1] - zeros[0], both_dated=all(zeros),
         silent=np.isnan(draft.landmarks_mm()).all(axis=(1, 2)).sum(),
         labelled=tuple((visibility > 0).any(axis=1).sum() for visibility in seen),
     ).rstrip().split("\n")  # fmt: skip

@@ -163,6 +163,8 @@ def _deeplabcut(path: Path) -> Iterator[Label]:
 
 
 def _sleap(path: Path) -> Iterator[Label]:
+    if path.suffix.lower() != ".slp":
+        raise ValueError(f"{path}: of SLEAP only .slp is read, not the analysis files that it exports. Name the .slp.")
     with h5py.File(path) as file:
         metadata = json.loads(bytes(file["metadata"].attrs["json"]).decode())
         names = [metadata["nodes"][link["id"]]["name"] for link in metadata["skeletons"][0]["nodes"]]

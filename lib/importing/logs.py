@@ -23,6 +23,7 @@ _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this 
 _ROUNDED = 0.25  # share of the rows that repeat the time before, from which on they count as rounded
 _DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
+_FAR = 10.0  # a value that recurs in all coordinates is no position if it is farther off than so many ranges of the others
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -54,7 +55,8 @@ def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], un
     """Raise a ValueError if the times of rows or frames repeat or go back, or if their median step makes `unit` doubtful."""
     for i, (before, now) in enumerate(pairwise(time), start=1):
         if now <= before:
-            what = f"the time {'repeats' if now == before else 'goes back'} ({before} s, then {now} s)"
+            told = [f"{round(t, 9).normalize():f} s" for t in (before, now)]
+            what = f"the time {'repeats' if now == before else 'goes back'} ({', then '.join(told)})"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
             steps = [later - earlier for earlier, later in pairwise(time)]
             rising = [step for step in steps if step > 0]
@@ -71,8 +73,8 @@ def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], un
 def uncommented(text: str, separator: str = "") -> list[str]:
     """The lines of a table, with comments and a row of units below the header replaced by blanks.
 
-    The last comment before rows of numbers is the header if it has as many cells, since `numpy.savetxt` writes headers so.
-    If no separator is given, that of the first row is found.
+    The last comment before the rows is the header if it has as many cells, no number among them, and the first row starts
+    with a number: so `numpy.savetxt` and `rostopic echo -p` write.  If no separator is given, that of the first row is found.
 
     >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n"), uncommented("t,x\\ns,mm\\n0.1,2\\n")
     (['', 't,x', '0.1,2'], ['t,x', '', '0.1,2'])
@@ -81,9 +83,10 @@ def uncommented(text: str, separator: str = "") -> list[str]:
     bare = ["" if line.lstrip()[:1] in ("#", "%") else line for line in lines]
     first = next((i for i, line in enumerate(bare) if line.strip()), 0)
     if header := next((line for line in reversed(lines[:first]) if line.strip()), "").lstrip(" \t#%"):
-        cells = bare[first].split(separator := separator or separator_of(bare[first]))
-        as_many = header.count(separator) == bare[first].count(separator)
-        if as_many and all(re.fullmatch(r"[-+]?\.?\d.*|nan|", cell.strip(' \t"'), re.IGNORECASE) for cell in cells):
+        names, cells = (line.split(separator or separator_of(bare[first])) for line in (header, bare[first]))
+        row = re.match(r'[\s"]*[-+]?\.?\d', cells[0])
+        numbers = [name for name in names if re.fullmatch(r'[\s"]*[-+]?\.?\d[-+\d.eE]*[\s"]*', name)]
+        if row and len(names) == len(cells) and not numbers:
             bare[first - 1] = header
     filled = [i for i, line in enumerate(bare) if line.strip()][:2]
     if len(filled) == 2:
@@ -99,12 +102,36 @@ def separator_of(line: str) -> str:
     return " " if " " in line and not re.search(r"[\t;,|]", line) else max("\t;,|", key=line.count)
 
 
-def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:
-    """Read exact times, the named columns (m,) with NaN for empty cells, and each row's place; from a CSV or ROS bag."""
+def text_of(path: Path) -> tuple[str, bool]:
+    """The text of a file in UTF-8, UTF-16 with a byte order mark, or else Windows-1252; and True if it is the last one."""
+    try:
+        return decoded(path, utf_16=True), False
+    except ValueError as refused:
+        with suppress(UnicodeDecodeError):
+            return path.read_bytes().decode("cp1252"), True
+        raise refused from None
+
+
+def read_columns(
+    path: Path, table: Table, names: Iterable[str], notes: list[str]
+) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:
+    """Read exact times, the named columns (m,) with NaN for empty cells, and each row's place; from a CSV or ROS bag.
+
+    `notes` gets a sentence about another encoding than UTF-8, and about a last line that is cut, which is left out.
+    """
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
+    if path.suffix.lower() in (".json", ".jsonl", ".npy", ".npz", ".mat", ".h5", ".parquet", ".xls", ".xlsx"):
+        raise ValueError(f"{path}: only CSV tables and ROS bags are read here. Convert it to CSV, one row for each time.")
     wanted = [table.time, *names]
-    rows = rows_of(path, "\n".join(uncommented(decoded(path, utf_16=True), table.separator)), table.separator)
+    text, by_excel = text_of(path)
+    notes += [f"{path.name} is not UTF-8 and was read as Windows-1252."] * by_excel
+    lines = uncommented(text, table.separator)
+    cells = [line.count(table.separator) + 1 for line in lines if line.strip()]
+    if text[-1:] not in "\r\n" and lines[-1].strip() and cells[-1] < min(cells[0], cells[-2:][0]):
+        notes.append(f"The last line of {path.name} is cut ({cells[-1]} of {cells[0]} cells) and was left out.")
+        lines.pop()
+    rows = rows_of(path, "\n".join(lines), table.separator)
     place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:
@@ -191,19 +218,28 @@ def _field(message: object, field: str, where: str) -> float | Decimal:
         raise ValueError(f"{where}: this field is not a number; name a number inside it.") from None
 
 
-def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
+def read_robot(
+    folder: Path, mapping: Mapping, notes: list[str]
+) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Read the robot's log, in the robot frame that the mapping asks for.
 
     Returns exact times (m,) and the landmarks (m, k, 3) mm, None, None.  If the log has poses of the tool instead: times,
     positions (m, 1, 3) mm, rotations (m, 3, 3), and the full angle (m,) rad between the jaws, or None if it is not logged.
+    `notes` gets a sentence about each thing that was not read as it stands, such as rows that were left out.
     """
     robot, pose = mapping.robot, mapping.robot.pose
     path = folder / robot.file
     groups = [robot.landmarks[name] for name in mapping.landmarks] if pose is None else [pose.position]
     names = [name for group in groups for name in group]
     names += [] if pose is None else [*pose.rotation, *([pose.gripper] if pose.gripper else [])]
-    time, columns, places = read_columns(path, robot, dict.fromkeys(names))
+    time, columns, places = read_columns(path, robot, dict.fromkeys(names), notes)
+    rows = list(zip(time, *(np.nan_to_num(values, nan=np.inf) for values in columns.values()), strict=True))
+    new = [i for i, row in enumerate(rows) if not i or row != rows[i - 1]]
+    if len(new) < len(rows):
+        notes.append(f"{path.name}: {len(rows) - len(new)} rows that repeat the row before were left out.")
+        time, places, columns = [time[i] for i in new], [places[i] for i in new], {n: x[new] for n, x in columns.items()}
     increasing(time, str(path), _STEP_S, "time_unit", places)
+    _blank_sentinels(columns, groups, notes)
     if empty := [name for name in names if np.isnan(columns[name]).all()]:
         raise ValueError(f"{path}: no row has a value in {', '.join(empty)}. Name other columns, or fewer landmarks.")
     x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
@@ -222,8 +258,27 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
     if pose.rotation_kind == "euler_xyz_deg":
         cure = 'convert them to degrees; or, if they are a rotation vector, set rotation_kind = "rotation_vector_rad"'
         _doubt_degrees(path, pose.rotation, np.stack([columns[name] for name in pose.rotation]), 2 * np.pi, cure)
-    R = turn @ _rotations(places, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
+    R = turn @ _rotations(places, pose, np.stack([columns[name] for name in pose.rotation], axis=-1), notes)
     return time, x, R, _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
+
+
+def _blank_sentinels(columns: dict[str, np.ndarray], groups: Sequence[Sequence[str]], notes: list[str]) -> None:
+    """Blank, in `columns`, numbers that stand for "no report": they recur in all three coordinates of a position at once.
+
+    Such a number is far from all other positions, or it is 0 and they move by less than their distance from 0.
+    """
+    beside = columns.keys() - {name for group in groups for name in group}  # the rotation and the gripper of a pose
+    for group in groups:
+        x = np.stack([columns[name] for name in group], axis=-1)
+        alike = (x == x[:, :1]).all(axis=1)  # NaN is not equal
+        others = x[~alike & np.isfinite(x).all(axis=1)]
+        for value in np.unique(x[alike, 0]) if len(others) else ():
+            rows = alike & (x[:, 0] == value)
+            distance = float(np.linalg.norm(others - value, axis=1).min())
+            if rows.sum() > 1 and distance > (_FAR if value else 1.0) * np.ptp(others, axis=0).max() > 0:
+                for name in (*group, *(beside if value else ())):
+                    columns[name][rows & (columns[name] == value)] = np.nan
+                notes.append(f"{value:g} in {', '.join(group)} was taken for no report, in {rows.sum()} rows.")
 
 
 def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:
@@ -248,17 +303,26 @@ def _doubt_degrees(path: Path, names: Sequence[str], angles: np.ndarray, most: f
         warnings.warn(f"{path}: {what}. Are they radians? Then {cure}.", stacklevel=2)
 
 
-def _rotations(places: list[str], pose: Pose, values: np.ndarray) -> np.ndarray:
-    """Rotations (m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty or all of a quaternion is 0."""
+def _rotations(places: list[str], pose: Pose, values: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Rotations (m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty or all of a quaternion is 0.
+
+    Quaternions of one length that is not 1 are normalised, which adds a sentence to `notes`.
+    """
     kind, quaternion = pose.rotation_kind, pose.rotation_kind.startswith("quaternion")
     known = np.isfinite(values).all(axis=1) & (values.any(axis=1) | (not quaternion))
-    v, R = values[known], np.full((len(values), 3, 3), np.nan)
+    v, R, why = values[known], np.full((len(values), 3, 3), np.nan), ""
     if kind == "matrix":
         v = v.reshape(-1, 3, 3)
         valid = (np.abs(v @ v.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < 1e-2) & (np.linalg.det(v) > 0)
         made = Rotation.from_matrix
     elif quaternion:
-        valid = np.abs(np.linalg.norm(v, axis=1) - 1) < 1e-2
+        length = np.linalg.norm(v, axis=1)
+        usual = float(np.median(length)) if len(v) else 1.0
+        valid = np.abs(length / usual - 1) < 1e-2
+        if abs(usual - 1) > 1e-2:
+            notes.append(f"The quaternions in {', '.join(pose.rotation)} have the length {usual:.4g}; they were normalised.")
+        if not valid.all():
+            why = f" (lengths vary from {length.min():.4g} to {length.max():.4g}; if the columns are right, normalise them)"
         made = partial(Rotation.from_quat, scalar_first=kind == "quaternion_wxyz")
     else:
         degrees = kind == "euler_xyz_deg"
@@ -266,7 +330,7 @@ def _rotations(places: list[str], pose: Pose, values: np.ndarray) -> np.ndarray:
         made = partial(Rotation.from_euler, "xyz", degrees=True) if degrees else Rotation.from_rotvec
     if not valid.all():
         row = np.flatnonzero(known)[valid.argmin()]
-        what = f"columns {', '.join(pose.rotation)} are no {kind}: {', '.join(f'{value:.6g}' for value in values[row])}"
-        raise ValueError(f"{places[row]}: {what}. Check rotation_kind; leave the cells of an unknown rotation empty.")
+        what = f"columns {', '.join(pose.rotation)} are no {kind}: {', '.join(f'{value:.6g}' for value in values[row])}{why}"
+        raise ValueError(f"{places[row]}: {what}. Check rotation_kind and rotation; leave the cells of an unknown one empty.")
     R[known] = made(v).as_matrix()
     return R

@@ -1,5 +1,6 @@
 """The mapping file of an import: where the data are in the source, in which units and under which names."""
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -95,7 +96,8 @@ class Robot(Table):
         columns = [self.time, *(column for landmark in (self.landmarks or {}).values() for column in landmark)]
         columns += [*self.pose.position, *self.pose.rotation, self.pose.gripper] if self.pose else []
         if twice := next((column for column in columns if columns.count(column) > 1), ""):
-            raise ValueError(f"the column {twice!r} is named twice; the time, each axis and each landmark have their own")
+            cure = "the time, each axis and each landmark have their own; pivot a table whose rows hold one landmark each"
+            raise ValueError(f"the column {twice!r} is named twice; {cure}")
 
 
 class Hinge(_Section):
@@ -172,8 +174,17 @@ def read_mapping(path: str | Path) -> Mapping:
     try:
         return Mapping.model_validate(read_toml(path))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        key, text = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
+        errors = error.errors(include_url=False, include_context=False)
+        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+        *parts, last = first["loc"] or ("the mapping",)
+        parts += [] if last == "float" else [last]  # only offset_s takes a number or a word
+        key, text = ".".join(map(str, parts)), repr(first["input"])
         value = f" = {text}" if len(text) < 60 and first["type"] != "missing" else ""
         text = first["msg"].removeprefix("Value error, ").removesuffix(".")
+        text = 'a number of seconds is needed, or the word "estimate"' if last == "float" else text
+        if first["type"] == "extra_forbidden":
+            schema = Mapping.model_json_schema()
+            known = {name for part in (schema, *schema["$defs"].values()) for name in part.get("properties", {})}
+            near = get_close_matches(str(last), sorted(known), 1)
+            text = f"no such key here; the nearest one is {near[0]}" if near else "no such key here"
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None

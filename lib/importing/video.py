@@ -1,6 +1,7 @@
 """Reads stereo frames from videos of any codec and from image files, as 8-bit RGB with the true time of each."""
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -9,7 +10,9 @@ from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
 
 import av
+import cv2
 import numpy as np
+from PIL import Image
 from scipy.spatial import KDTree
 
 from lib.importing.logs import exact_seconds, increasing, read_columns, since
@@ -20,6 +23,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
 _STEP_S = 1e-4, 60.0  # plausible median step of frames; outside this range the unit of time must be wrong
 _DEPTH_SAMPLES = 12  # number of frames in which the brightest value is searched
+_LOST = 1.5  # a step between frames, in usual steps, above which a frame is missing between them
 _DECIMAL = re.compile(r"(?<![\d.])(\d+\.|\d{10}[_-])(\d{1,9})$")  # over 9 digits after a point are a time themselves
 
 
@@ -66,7 +70,8 @@ class _Images:
         for (one, path), (other, later) in pairwise(order):
             if one == other:
                 raise ValueError(f"{later}: has the same number as {path.name}. Narrow the pattern to one camera.")
-        self.stamps = None
+        self.stamps, exif = None, _orientation(self.files[0])
+        self.turned = f"has the EXIF orientation {exif}" if exif > 1 else ""
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
         counted &= len(set(map(int, seconds))) < 2
         self.numbers = {path.stem: n for n, path in enumerate(self.files)}
@@ -76,7 +81,19 @@ class _Images:
         return len(self.files)
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        return (read_image(self.files[index], bit_depth=None) for index in wanted)
+        for path in (self.files[index] for index in wanted):
+            image = read_image(path, bit_depth=None)
+            if _orientation(path) > 1:  # then OpenCV turns it
+                image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+            yield image
+
+
+def _orientation(path: Path) -> int:
+    """The EXIF orientation of an image, with which programs show it; OpenCV refuses a TIFF that has one."""
+    if path.suffix.lower() in (".jpg", ".jpeg", ".png"):
+        with suppress(OSError, SyntaxError, ValueError), Image.open(path) as image:  # reads the header only
+            return image.getexif().get(0x0112, 1)
+    return 1
 
 
 class _Film:
@@ -101,8 +118,10 @@ class _Film:
         whole = len(packets) == count and 0 < len(ticks) == len(times)
         if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):
             raise ValueError(f"{path}: the video is cut off: {len(packets)} of {count} frames, {end_s:.1f} s. Copy it again.")
-        first = None if counted else next(self._decoded(), None)
-        if first and first.pts in ticks:  # nothing before the first key frame can be decoded
+        first = next(self._decoded(), None)
+        self._quarters = round(first.rotation / 90) if first else 0  # anticlockwise, by the display matrix
+        self.turned = f"states that it is shown turned by {abs(first.rotation)} degrees" if self._quarters else ""
+        if first and not counted and first.pts in ticks:  # nothing before the first key frame can be decoded
             ticks = ticks[ticks.index(first.pts) :]
         self.stamps, self._ticks = [tick * base for tick in ticks], [] if counted else ticks
 
@@ -136,7 +155,8 @@ class _Film:
             if index in wanted:
                 deep = max(c.bits for c in frame.format.components) == 16
                 # A camera may use 12 of 16 bits.  Formats of fewer bits state their depth, so PyAV scales them to 8.
-                yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                image = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                yield np.ascontiguousarray(np.rot90(image, self._quarters))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +169,7 @@ class StereoSource:
     time: list[Decimal]
     bit_depths: list[int | None]  # of each reel: bits used by 16-bit frames, which are scaled to 8; None for 8-bit frames
     dropped: int  # number of frames that have no partner
+    notes: list[str]  # sentences on what was read otherwise than it stands in the files
 
     def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Left and right images, (h, w, 3) uint8 RGB."""
@@ -186,7 +207,8 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     if len(reels) == 2 and (shared := sorted({*reels[0].files} & {*reels[1].files})):
         raise ValueError(f"{shared[0]}: video.left and video.right both take it. Name each camera's own files.")
-    times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
+    notes = [f"{reel.files[0].name} {reel.turned}; its camera's images were turned so." for reel in reels if reel.turned]
+    times = [_times(folder, video, reel, place, notes) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")
     index = _paired(folder, times)
@@ -197,7 +219,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     dropped, index = sum(map(len, times)) - len(reels) * len(index), np.array(kept)
     time = [times[0][i] for i in index[:, 0]]
     depths = [video.bit_depth] * len(reels) if video.bit_depth else _bit_depths(reels, index)
-    return StereoSource(reels, video, index, time, depths, dropped)
+    return StereoSource(reels, video, index, time, depths, dropped, list(dict.fromkeys(notes)))
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
@@ -212,19 +234,22 @@ def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
     return [(own - (min(first) if together else own[0])) // usual for own in numbers]
 
 
-def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:
+def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray, notes: list[str]) -> list[Decimal]:
     if video.times == "fps":
         return [Decimal(int(place)) / Decimal(str(video.fps)) for place in places]
     if video.times == "names" and reel.stamps is None:
         return [exact_seconds(str(n), video.name_unit, str(p)) for n, p in zip(reel.in_names, reel.files, strict=True)]
     if video.times == "table":
-        time, _, rows = read_columns(folder / video.table.file, video.table, [])
+        time, _, rows = read_columns(folder / video.table.file, video.table, [], notes)
         increasing(time, str(folder / video.table.file), _STEP_S, "time_unit", rows)
         if len(time) != len(reel):
             raise ValueError(f"{folder / video.table.file}: {len(time)} times for {len(reel)} frames of {reel.files[0]}.")
         return time
     if reel.stamps is None or video.times == "names":
         raise ValueError(f"{reel.files[0]}: has no times of this kind; set video.times to fps, table, names or container.")
+    if repeats := len(reel.stamps) - len(set(reel.stamps)):
+        cure = 'Set video.times = "fps" with their rate, or "table" with a table of their times'
+        raise ValueError(f"{reel.path}: {repeats} of its {len(reel)} frames have the time of another one. {cure}.")
     return reel.stamps
 
 
@@ -240,6 +265,11 @@ def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
     if 2 * len(index) < min(len(left), len(right)):
         what = f"only {len(index)} of {len(left)} left and {len(right)} right frames lie within half a frame of each other"
         raise ValueError(f"{folder}: {what}. Left and right need one clock; with video.times = 'fps' frames pair by number.")
+    even = all(len(side) > 1 and np.diff(side).max() < _LOST * np.median(np.diff(side)) for side in (left, right))
+    if even and len(left) != len(right) and (index == np.arange(len(index))[:, None]).all():  # the rest is at the end
+        what = f"{len(left)} left and {len(right)} right frames, both at a steady rate; those at the end have no partner"
+        why = "If one camera lost frames before, later pairs are of different instants"
+        warnings.warn(f"{folder}: {what}. {why}: `python3 -m lib check` on the recording finds out.", stacklevel=2)
     return index
 
 

@@ -337,8 +337,13 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
         raise ValueError(f"{path}: no row holds {landmarks[0]} and one more; log {', '.join(landmarks)} in each row.")
     reach_mm = float(np.nanmedian(reach))
     if not 0.25 <= reach_mm <= 100:  # a jaw or shaft in metres, inches or micrometres falls outside
-        what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.25 to 100)"
-        raise ValueError(f"{path}: {what}. Metres, inches or micrometres? Convert to mm.")
+        own_mm = [float(np.median(r[np.isfinite(r)])) if np.isfinite(r).any() else np.nan for r in reach.T]
+        far = [name for name, r in zip(landmarks[1:], own_mm, strict=True) if not 0.25 <= r <= 100]
+        told = ", ".join(f"{r:.4g} to {name}" for name, r in zip(landmarks[1:], own_mm, strict=True))
+        cure = "Metres, inches or micrometres? Convert to mm"
+        cure = f"Check the columns of {', '.join(far)}" if len(far) < len(own_mm) else cure
+        what = f"the median distances from {landmarks[0]} are {told}, not plausible in mm (0.25 to 100)"
+        raise ValueError(f"{path}: {what}. {cure}.")
     return Kinematics(time_s, x)
 
 

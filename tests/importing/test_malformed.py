@@ -240,10 +240,12 @@ SPOILT = {
     "decimal commas": (line(7, lambda row, _: row.replace(".", ",")), r"log\.csv, line 8: 20 cells.*decimal"),
     "no time": (line(7, lambda row, _: "," + row.split(",", 1)[1]), r"log\.csv, line 8, column time_s: '' is not a time"),
     "decreasing times": (line(7, lambda row, lines: lines[2]), r"log\.csv, line 8: the time goes back \(.*Sort"),
-    "repeated times": (line(7, lambda row, lines: lines[6]), r"log\.csv, line 8: the time repeats \(.*drop"),
+    "repeated times": (line(7, lambda row, lines: lines[6].rsplit(",", 1)[0] + ",1"),
+        r"log\.csv, line 8: the time repeats \(.*drop"),
     "rounded times": (rounded_times, r"log\.csv, line \d: the time repeats .* rounded to 1 s\. .*more digits; .*spread"),
     "empty log": (edit("log.csv", lambda t: t.splitlines()[0] + "\n"), r"log\.csv: the table has no row"),
-    "not UTF-8": (bytes_of("log.csv", b"time_s,\xff\n"), r"log\.csv, line 1: the text is not UTF-8"),
+    "not UTF-8": (bytes_of("log.csv", b"time_s,\x81\n"), r"log\.csv, line 1: the text is not UTF-8"),
+    "JSON lines": (told("log.csv", "log.jsonl"), r"log\.jsonl: only CSV tables and ROS bags .* Convert it to CSV, one row"),
     "metres called mm": (edit("log.csv", lambda t: _scaled(t, 1e-3)), r"log\.csv.*length_unit"),
     "mm called metres": (told('length_unit = "mm"', 'length_unit = "m"'), r"log\.csv.*moves over .* mm.*length_unit"),
     "ms called s": (edit("log.csv", lambda t: _scaled(t, 1e3, times=True)), r"log\.csv: entries are 400 s apart.*time_unit"),
@@ -251,7 +253,8 @@ SPOILT = {
         r"log\.csv: entries are 4e-07 s apart.*time_unit"),
     "clocks apart": (told("[robot]\n", "[robot]\noffset_s = 500\n"),
         r"log\.csv: its times \(.*frames \(.*\) do not overlap\. "
-        r"Set robot\.offset_s \(now 500\.0\) in .*map\.toml to a number from -?\d.*overlap \(.*\)\.$"),
+        r"If the log is of the same run, set robot\.offset_s \(now 500\.0\) in .*map\.toml to a number from -?\d"
+        r".*overlap \(.*\)\.$"),
     "a dated log": (edit("log.csv", lambda t: re.sub(r"(?m)^-?[\d.]+", lambda m: f"{1.7e9 + float(m[0]):.3f}", t)),
         r"log\.csv: its times \(1.*do not overlap.*map\.toml .*or to \"estimate\" if log and video"),
     "an image of 16 bits among others": (images(lambda f: cv2.imwrite(
@@ -273,6 +276,7 @@ SPOILT = {
     "cut XML": (cvat("<annotations><image"), r"bad\.xml: not CVAT"),
     "several points": (cvat(SEVERAL), r"bad\.xml: .*several points"),
     "not SLEAP": (labels("sleap", "x.slp"), r"x\.slp: not a \.slp file"),
+    "an analysis file of SLEAP": (labels("sleap", "x.analysis.h5"), r"x\.analysis\.h5: of SLEAP only \.slp is read.*Name"),
     "not DeepLabCut": (labels("deeplabcut", "CollectedData_x.csv", b"a,b\n1,2\n"),
         r"CollectedData_x\.csv: not labels of DeepLabCut"),
     "not Label Studio": (labels("label_studio", "x.json", b'[{"data": 3}]'), r"x\.json: not JSON of Label Studio"),
@@ -299,12 +303,21 @@ SPOILT = {
         r"map\.toml: robot: the column 'tip_1_x' is named twice"),
     "a rotation named as position": (pose(old='"qw", "qx"', new='"px", "qx"'), r"robot: the column 'px' is named twice"),
     "a misspelt key": (told("[robot]\n", '[robot]\nlenght_unit = "m"\n'),
-        r"map\.toml: robot\.lenght_unit = 'm': Extra inputs"),
+        r"map\.toml: robot\.lenght_unit = 'm': no such key here; the nearest one is length_unit\."),
+    "a misspelt key in place of a required one": (told("length_unit", "lenght_unit"),
+        r"map\.toml: robot\.lenght_unit = 'mm': no such key here; the nearest one is length_unit\."),
+    "a key like no other": (told("[robot]\n", "[robot]\nzqj = 1\n"), r"map\.toml: robot\.zqj = 1: no such key here\. data/"),
+    "a misspelt estimate": (told("[robot]\n", '[robot]\noffset_s = "estimated"\n'),
+        r"robot\.offset_s = 'estimated': a number of seconds is needed, or the word \"estimate\"\."),
     "a missing key": (told('length_unit = "mm"\n', ""), r"map\.toml: robot\.length_unit: Field required"),
     "not TOML": (told("[robot]", "[robot"), r"map\.toml: not valid TOML"),
     "unfit rotations": (pose(old='"px", "py", "pz"]\nrotation = ["qw"', new='"qw", "py", "pz"]\nrotation = ["px"'),
         r"pose\.tsv, line 2: columns px, qx, .* are no quaternion_wxyz: -?[\d.]+, .*\. Check rotation_kind"),
-    "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0\. Check rot"),
+    "a wrong rotation": (wrong_rotation, r"pose\.tsv, line 8: columns qw, qx, qy, qz are no quat.*: 2, 0, 0, 0 "
+        r"\(lengths vary from 1 to 2; .* normalise them\)\. Check rot"),
+    "a tip elsewhere": (edit("log.csv", lambda t: _scaled(t, 100, column=4)),
+        r"log\.csv, read with .*map\.toml: the median distances from base are \d+ to tip_1, [23]\.\d+ to tip_2, "
+        r"not plausible in mm \(0\.25 to 100\)\. Check the columns of tip_1\."),
     "an empty landmark": (edit("log.csv", lambda t: re.sub(r"(?m)^(-?\d.*)(,[^,]*){3}$", r"\1,,,", t)),
         r"log\.csv: no row has a value in tip_2_x, tip_2_y, tip_2_z\. Name other columns"),
     "degrees called radians": (pose(old='gripper_unit = "deg"', new='gripper_unit = "rad"'),
@@ -313,14 +326,16 @@ SPOILT = {
         r"the position of base, tip_1, tip_2 in the tool frame is not given; give tool\.landmarks_mm"),
     "a jaw along its hinge": (pose(tool=HINGE.replace("axis = [0, 0, 1]", "axis = [1, 0, 0]")),
         r"the jaw lies along the axis"),
-    "jaws that never open": (shut, r"the jaws open by only 0 rad, which does not determine the hinge"),
+    "jaws that never open": (shut, r"tool\.estimate, with offset_s = 1700000000\.0: "
+        r"the jaws open by only 0 rad, which does not determine the hinge"),
 }  # fmt: skip
 
 
-def _scaled(text: str, factor: float, times: bool = False) -> str:
+def _scaled(text: str, factor: float, times: bool = False, column: int | None = None) -> str:
     header, *rows = text.splitlines()
     cells = [[float(cell) for cell in row.split(",")] for row in rows]
-    cells = [[(v * factor if (k == 0) == times else v) for k, v in enumerate(row)] for row in cells]
+    scaled = [k == column if column else (k == 0) == times for k in range(len(cells[0]))]
+    cells = [[v * factor if scales else v for v, scales in zip(row, scaled, strict=True)] for row in cells]
     return "\n".join([header, *(",".join(f"{v:.9f}" for v in row) for row in cells)]) + "\n"
 
 
