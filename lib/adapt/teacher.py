@@ -263,7 +263,8 @@ def teach(
         offset, covariance = robots_part(offsets, own * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
-    agrees = not shares[0] < LEAST_RIGHT  # also if it has few detections
+    # A base with few detections agrees, too.  Near the robot's report a detector may follow the robot: that says nothing new.
+    agrees = not shares[0] < LEAST_RIGHT if before is None else before.agrees_on_base
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns, agrees)
     if clicked:
         teacher = _as_labelled(teacher, clicks)
