@@ -339,6 +339,7 @@ class _Work:
         """A first teacher.  The detector may mark the kink of angled jaws, or a ring on the shaft, instead of the base.
 
         Then the tips alone give the cameras, and the base is detected near the robot's; `name` is that of these detections.
+        Labels set by hand tell where the base is, so with them nothing else is tried.
         """
         try:
             return teach(self.recording, seen, by_hand=by_hand)

@@ -109,8 +109,8 @@ class Calibration:
     def variations(self) -> list[tuple[StereoRig, LandmarkOffsets | None]]:
         """Rigs and offsets that differ by one standard deviation along each principal axis of `joint_covariance`.
 
-        The last one differs by the distance that is `not_shown`.  The squared differences of what is computed from them add
-        up to its variance.
+        The last one is at the finite distance that is `not_shown`.  For any result, the squares of its differences add up to
+        its variance.
         """
         _ = self.pair  # a ValueError refuses a single camera
         values, vectors = np.linalg.eigh(self.joint_covariance)

@@ -17,7 +17,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import separator_of, text_of, topics_of, uncommented
-from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
+from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, quarters
 from lib.recordings.tables import read_toml
 
 _LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
@@ -72,7 +72,8 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
     if len(films) == 1:
         with av.open(str(paths[films[0]])) as container:
             stream = container.streams.video[0]
-            layout = "top_bottom" if stream.width < 1.1 * stream.height else "side_by_side"
+            shown = (stream.width, stream.height)[:: -1 if quarters(next(container.decode(stream), None)) % 2 else 1]
+            layout = "top_bottom" if shown[0] < 1.1 * shown[1] else "side_by_side"
         return {"layout": layout, "file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
     kinds = Counter((Path(name).parent / f"*{Path(name).suffix}").as_posix() for name in images)
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
@@ -167,6 +168,7 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
     cells = columns[time["time"]]
     if 2 * len(set(cells)) < len(cells):
         what = f"{len(cells)} rows have only {len(set(cells))} times in {time['time']!r}; pivot it if rows hold one landmark"
+        what += ", or export the times with more digits"
         raise ValueError(f"{paths[name]}: {what}. {_CURE}.")
     turn = _rotation(columns, dialect["decimal"])
     groups: dict[str, dict[str, str]] = {}

@@ -55,7 +55,7 @@ def increasing(time: list[Decimal], where: str, usual_s: tuple[float, float], un
     """Raise a ValueError if the times of rows or frames repeat or go back, or if their median step makes `unit` doubtful."""
     for i, (before, now) in enumerate(pairwise(time), start=1):
         if now <= before:
-            told = [f"{round(t, 9).normalize():f} s" for t in (before, now)]
+            told = [f"{t:.9f}".rstrip("0").rstrip(".") + " s" for t in (before, now)]
             what = f"the time {'repeats' if now == before else 'goes back'} ({', then '.join(told)})"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
             steps = [later - earlier for earlier, later in pairwise(time)]
@@ -268,6 +268,11 @@ def _blank_sentinels(columns: dict[str, np.ndarray], groups: Sequence[Sequence[s
     Such a number is far from all other positions, or it is 0 and they move by less than their distance from 0.
     """
     beside = columns.keys() - {name for group in groups for name in group}  # the rotation and the gripper of a pose
+    table = np.stack([columns[name] for group in groups for name in group], axis=-1)
+    if len(groups) > 1 and (same := (table == table[:, :1]).all(axis=1)).any():  # landmarks cannot coincide
+        for name in (name for group in groups for name in group):
+            columns[name][same] = np.nan
+        notes.append(f"{same.sum()} rows with one number in all coordinates of all landmarks were taken for no report.")
     for group in groups:
         x = np.stack([columns[name] for name in group], axis=-1)
         alike = (x == x[:, :1]).all(axis=1)  # NaN is not equal
@@ -318,7 +323,7 @@ def _rotations(places: list[str], pose: Pose, values: np.ndarray, notes: list[st
     elif quaternion:
         length = np.linalg.norm(v, axis=1)
         usual = float(np.median(length)) if len(v) else 1.0
-        valid = np.abs(length / usual - 1) < 1e-2
+        valid = (usual > 1e-3) & ((np.abs(length / usual - 1) < 1e-2) | (np.abs(length - 1) < 1e-2))
         if abs(usual - 1) > 1e-2:
             notes.append(f"The quaternions in {', '.join(pose.rotation)} have the length {usual:.4g}; they were normalised.")
         if not valid.all():

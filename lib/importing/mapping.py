@@ -184,7 +184,12 @@ def read_mapping(path: str | Path) -> Mapping:
         text = 'a number of seconds is needed, or the word "estimate"' if last == "float" else text
         if first["type"] == "extra_forbidden":
             schema = Mapping.model_json_schema()
-            known = {name for part in (schema, *schema["$defs"].values()) for name in part.get("properties", {})}
-            near = get_close_matches(str(last), sorted(known), 1)
+            parts = [("the top", schema), *((f"[{name.lower()}]", part) for name, part in schema["$defs"].items())]
+            homes: dict[str, list[str]] = {}
+            for home, part in parts:
+                for name in part.get("properties", {}):
+                    homes.setdefault(name, []).append(home)
+            near = get_close_matches(str(last), sorted(homes), 1)
             text = f"no such key here; the nearest one is {near[0]}" if near else "no such key here"
+            text = f"no such key here; it belongs to {' or '.join(homes[str(last)])}" if last in homes else text
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None

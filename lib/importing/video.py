@@ -19,7 +19,8 @@ from lib.importing.logs import exact_seconds, increasing, read_columns, since
 from lib.importing.mapping import Video
 from lib.recordings import read_image, to_8_bits
 
-IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_TIFF = (".tif", ".tiff")
+IMAGES = (".png", ".jpg", ".jpeg", *_TIFF, ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
 _STEP_S = 1e-4, 60.0  # plausible median step of frames; outside this range the unit of time must be wrong
 _DEPTH_SAMPLES = 12  # number of frames in which the brightest value is searched
@@ -83,17 +84,24 @@ class _Images:
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
         for path in (self.files[index] for index in wanted):
             image = read_image(path, bit_depth=None)
-            if _orientation(path) > 1:  # then OpenCV turns it
+            if path.suffix.lower() not in _TIFF and _orientation(path) > 1:  # OpenCV turns a TIFF in any case
                 image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
             yield image
 
 
 def _orientation(path: Path) -> int:
-    """The EXIF orientation of an image, with which programs show it; OpenCV refuses a TIFF that has one."""
-    if path.suffix.lower() in (".jpg", ".jpeg", ".png"):
-        with suppress(OSError, SyntaxError, ValueError), Image.open(path) as image:  # reads the header only
-            return image.getexif().get(0x0112, 1)
+    """The EXIF orientation of an image, 1 to 8, with which programs show it."""
+    with suppress(OSError, SyntaxError, ValueError), Image.open(path) as image:  # reads the header only
+        for text in ("xmp", "XML:com.adobe.xmp"):  # Pillow also looks there, OpenCV does not
+            image.info.pop(text, None)
+        found = image.getexif().get(0x0112, 1)
+        return found if found in range(1, 9) else 1
     return 1
+
+
+def quarters(frame: av.VideoFrame | None) -> int:
+    """Quarter turns, anticlockwise, by which players show a frame of a video (its display matrix); 0 for None."""
+    return round(frame.rotation / 90) if frame else 0
 
 
 class _Film:
@@ -119,8 +127,13 @@ class _Film:
         if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):
             raise ValueError(f"{path}: the video is cut off: {len(packets)} of {count} frames, {end_s:.1f} s. Copy it again.")
         first = next(self._decoded(), None)
-        self._quarters = round(first.rotation / 90) if first else 0  # anticlockwise, by the display matrix
-        self.turned = f"states that it is shown turned by {abs(first.rotation)} degrees" if self._quarters else ""
+        self._quarters = quarters(first)
+        way = "" if self._quarters % 2 == 0 else " anticlockwise" if self._quarters > 0 else " clockwise"
+        self.turned = f"states that it is shown turned by {90 * abs(self._quarters)} degrees{way}" if self._quarters else ""
+        if first and (matrix := first.side_data.get("DISPLAYMATRIX")) is not None:
+            a, b, _, c, d, *_ = np.frombuffer(matrix, np.int32).astype(float)
+            if a * d < b * c:
+                raise ValueError(f"{path}: states that it is shown mirrored. Mirror its pixels (`ffmpeg -i` does).")
         if first and not counted and first.pts in ticks:  # nothing before the first key frame can be decoded
             ticks = ticks[ticks.index(first.pts) :]
         self.stamps, self._ticks = [tick * base for tick in ticks], [] if counted else ticks

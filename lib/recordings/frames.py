@@ -28,7 +28,7 @@ class StereoFrame:
 
 
 def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int | None = 0) -> np.ndarray:
-    """Read an image file, colour or grey, as (h, w, 3) uint8 RGB.  An EXIF orientation is ignored.
+    """Read an image file, colour or grey, as (h, w, 3) uint8 RGB.  An EXIF orientation is ignored, except in a TIFF.
 
     Args:
         image_size_px: Required (width, height).

@@ -262,7 +262,7 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         own = sandwich(information if indefinite else hessian, gradient[used], parameters * n / size)
     covariance = (_STATED_ROWS * covariance + n * own) / (_STATED_ROWS + n)
     for other, own in data.variations:  # the step that another rig, with its offsets, would cause
-        x = np.where(np.isfinite(own.x_mm), own.x_mm, data.x)
+        x = np.where(data.seen.any(axis=1, keepdims=True) & np.isfinite(own.x_mm), own.x_mm, data.x)
         change = np.nan_to_num(own.stacked_px) - np.hstack(other.project(found.state.apply(x))) - residual
         step = np.linalg.lstsq(information, gradients(found.state, (change, distance2, weights))[1].sum(axis=0))[0]
         covariance = covariance + np.outer(step, step)

@@ -31,7 +31,8 @@ _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and le
 AS_GOOD = 6.0
 _SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (16 numbers) whose frames are examined
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
-_UNFIT_SHARE, _UNFIT_ONE = 0.2, 0.35  # least share of gross errors of an unfit detector: in all landmarks, or in one
+#: Least share of gross errors of an unfit detector: in all landmarks, or in one that has at least so many detections.
+_UNFIT_SHARE, _UNFIT_ONE, _UNFIT_FEWEST = 0.2, 0.35, 16
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
@@ -262,8 +263,8 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where the cameras see them."
     if off is not far:
         each = [problem.used & (problem.landmark == k)[:, None] for k in range(len(LANDMARKS))]
-        wrong = [far[own].sum() / max(own.sum(), 1) for own in each]
-        if max(wrong) < _UNFIT_ONE:
+        wrong = [far[own].mean() if own.sum() >= _UNFIT_FEWEST else 0.0 for own in each]
+        if max(wrong) < _UNFIT_ONE or share < 0.05:
             return []
         what = f"{100 * max(wrong):.0f} % of the detections of {LANDMARKS[int(np.argmax(wrong))]}"
         text = f"{what} lie more than 5 % of the tool's length from where the cameras see it."

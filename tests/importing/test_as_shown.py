@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lib.importing import guess_mapping, import_recording, logs, read_mapping
+from lib.importing import guess_mapping, import_recording, logs, read_mapping, video
 from lib.recordings import Recording
 from tests.importing import foreign
 from tests.importing.test_import import HINGE, source_of, thinned
@@ -58,7 +58,22 @@ def test_a_video_is_imported_as_players_show_it(degrees, few, tmp_path):
         did, recording = quietly(folder, mapping, tmp_path / "eye")
         expected = np.rot90(few.frames[3, 1], -(degrees + more) // 90)
         assert np.abs(recording.frames[3].right.astype(float) - expected).mean() < 4
-        assert f"left.mp4 states that it is shown turned by {degrees} degrees; its camera's images were turned so." in did
+        turned = "90 degrees clockwise" if degrees == 90 else "180 degrees"
+        assert f"left.mp4 states that it is shown turned by {turned}; its camera's images were turned so." in did
+
+
+def test_a_video_that_is_shown_mirrored_is_refused_and_a_turned_pair_is_guessed_as_shown(few, tmp_path):
+    foreign.side_by_side(tmp_path, few)
+    foreign.robot_csv(tmp_path, few)
+    data = bytearray((tmp_path / "stereo.mp4").read_bytes())
+    at = data.index(b"tkhd") + 44
+    data[at : at + 24] = struct.pack(">6i", -65536, 0, 0, 0, 65536, 0)
+    (tmp_path / "stereo.mp4").write_bytes(data)
+    with pytest.raises(ValueError, match="stereo.mp4: states that it is shown mirrored"):
+        video._Film(tmp_path / "stereo.mp4")
+    data[at : at + 24] = struct.pack(">6i", 0, 65536, 0, -65536, 0, 0)
+    (tmp_path / "stereo.mp4").write_bytes(data)
+    assert 'layout = "top_bottom"' in guess_mapping(tmp_path)
 
 
 @pytest.mark.parametrize(("orientation", "shown"), [
@@ -124,6 +139,21 @@ def test_a_number_that_stands_for_no_report_leaves_a_gap(value, few, tmp_path):
     x_mm = logs.read_robot(tmp_path, read_mapping(log_of(tmp_path, few, change)), notes := [])[1]
     assert np.argwhere(np.isnan(x_mm).any(axis=2)).tolist() == [[7, 1], [30, 1], [31, 1]]
     assert notes == [f"{value} in tip_1_x, tip_1_y, tip_1_z was taken for no report, in 3 rows."]
+
+
+def test_a_number_in_all_coordinates_of_all_landmarks_is_no_report(few, tmp_path):
+    """Even one that lies among the positions: landmarks cannot coincide."""
+
+    def change(text: str) -> bytes:
+        header, *rows = (row.split(",") for row in text.splitlines())
+        for i in (30, 31):
+            rows[i][1:] = ["0"] * 9
+        return "\n".join(map(",".join, [header, *rows])).encode()
+
+    around = replace(few, x_mm=few.x_mm - few.x_mm[:, :1].mean(axis=0))
+    x_mm = logs.read_robot(tmp_path, read_mapping(log_of(tmp_path, around, change)), notes := [])[1]
+    assert np.flatnonzero(np.isnan(x_mm).all(axis=(1, 2))).tolist() == [30, 31]
+    assert notes == ["2 rows with one number in all coordinates of all landmarks were taken for no report."]
 
 
 @pytest.mark.parametrize("rest", [[5.0, 5.0, 5.0], [0.0, 0.0, 0.0], [40.0, 40.0, 40.0]])

@@ -13,6 +13,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from lib import paths
@@ -719,14 +720,33 @@ def test_offsets_of_the_landmarks_are_no_part_of_the_clock(monkeypatch):
     u = [u.reshape(60, 3, 2) + rng.normal(0, 1, (60, 3, 2)) for u in recording.truth.rig.project(x.reshape(-1, 3))]
     late = replace(log, time_s=log.time_s + 2.0)
     draft = replace(recording, kinematics=late, annotations=Annotations(*u), readout_s=0.0, frames=Frames(None, None, time_s))
-    found = importer._clock(draft, search_s=3.0)
+    found = importer._clock(draft, 3.0, [])
     assert abs(found.offset_s - 2.0) < min(4e-4, 4 * found.sd_s)
 
     def undetermined(*data, **options):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(importer, "clock_error", undetermined)  # then the offset stays that of the shift alone
-    assert abs(importer._clock(draft, search_s=3.0).offset_s - 2.0) < 0.05
+    assert abs(importer._clock(draft, 3.0, []).offset_s - 2.0) < 0.05
+
+
+def test_a_few_labels_find_no_clock_in_the_log_of_another_run():
+    """Among many offsets its motion fits eight labelled frames by chance; that of their own run does so far better."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    log, marks = recording.kinematics, recording.annotations
+    known = np.isin(np.arange(34), np.linspace(0, 33, 8).astype(int))[:, None, None]
+    labels = Annotations(*(np.where(known, u, np.nan) for u in (marks.u_left, marks.u_right)))
+    for seed in (2, 4, 5):
+        rng = np.random.default_rng(seed)
+        place, turn = (gaussian_filter1d(rng.normal(size=(6000, 3)), 30, axis=0) for _ in range(2))
+        place = log.x_mm[:, 0].mean(axis=0) + place * log.x_mm[:, 0].std(axis=0) / place.std(axis=0)
+        R = Rotation.from_rotvec(0.2 * turn / turn.std(axis=0)).as_matrix()
+        moving = place[:, None] + np.einsum("nij,kj->nki", R, log.x_mm[0] - log.x_mm[0, 0])
+        other = replace(recording, kinematics=Kinematics(np.arange(6000) / 50, moving), annotations=labels)
+        with pytest.raises(ValueError, match="offset_s"):
+            importer._clock(other, 0.5, [])
+    late = replace(recording, kinematics=replace(log, time_s=log.time_s + 17), annotations=labels)
+    assert abs(importer._clock(late, 0.5, notes := []).offset_s - 17) < 1e-3 and len(notes) == 1
 
 
 def test_jaws_are_estimated_from_poses_gripper_and_labels(shipped, tmp_path):
@@ -776,4 +796,4 @@ def test_a_wrong_rate_of_frames_is_named_where_the_clock_is_beyond_its_search(mo
     fast_s = np.arange(len(recording)) / recording.fps
     fast = replace(recording, folder=Path("no frames.csv"), frames=Frames(None, None, fast_s))
     with pytest.raises(ValueError, match=r"at 25 fps last 1\.\d s, but the robot's log \d+\.\d s\..*frames\.csv"):
-        importer._clock(fast, search_s=0.5)
+        importer._clock(fast, 0.5, [])

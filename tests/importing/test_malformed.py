@@ -306,6 +306,8 @@ SPOILT = {
         r"map\.toml: robot\.lenght_unit = 'm': no such key here; the nearest one is length_unit\."),
     "a misspelt key in place of a required one": (told("length_unit", "lenght_unit"),
         r"map\.toml: robot\.lenght_unit = 'mm': no such key here; the nearest one is length_unit\."),
+    "a key of another section": (told("[robot]\n", "[robot]\nexchanged = true\n"),
+        r"map\.toml: robot\.exchanged = True: no such key here; it belongs to \[video\]\."),
     "a key like no other": (told("[robot]\n", "[robot]\nzqj = 1\n"), r"map\.toml: robot\.zqj = 1: no such key here\. data/"),
     "a misspelt estimate": (told("[robot]\n", '[robot]\noffset_s = "estimated"\n'),
         r"robot\.offset_s = 'estimated': a number of seconds is needed, or the word \"estimate\"\."),

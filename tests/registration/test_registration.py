@@ -239,6 +239,18 @@ def test_covariances_allow_for_the_calibration_with_its_offsets_and_an_unknown_d
     assert np.mean(scores["alone"]) > 50
 
 
+def test_a_tool_that_no_camera_sees_may_be_anywhere():
+    """Behind near cameras, too, as a retracted tool."""
+    rows = tool_sweep(0, frames=20, distance_mm=150.0)[0]
+    found, gone = calibrate_as_shown(rows), rows.frame >= 17
+    u = [np.where(gone[:, None], np.nan, u) for u in (rows.u_left, rows.u_right)]
+    away = -400 * found.rig.left.viewing_direction * gone[:, None]
+    later = replace(rows, x_mm=rows.x_mm + away, u_left=u[0], u_right=u[1])
+    varied = [(rig, with_offsets(later, offsets)) for rig, offsets in found.variations]
+    fit = register_images(found.rig, with_offsets(later, found.offsets), variations=varied, sigma_x_mm=0.01)
+    assert np.isfinite(fit.covariance).all()
+
+
 def test_covariance_at_grows_with_distance():
     _, *data = scene(1)
     fit = register_images(RIG, *data)
