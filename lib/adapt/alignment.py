@@ -42,9 +42,8 @@ _FAULTS = dict.fromkeys((
 ), 0.15) | {"robot_drifts": 0.3, "robot_noise": 0.3}  # fmt: skip
 #: Residuals below this share of the tool's length are harmless, whatever fault explains them.
 _HARMLESS = 0.01
-#: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion; and the step's
-#: largest standard deviation relative to that of the estimate before, which knows no offsets and so states too small a one.
-_LARGEST_STEP_S, _SURER = 0.03, 1.5
+#: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.
+_LARGEST_STEP_S = 0.03
 #: Fewest labelled pairs that determine outliers and offsets; with fewer, the standard deviation of a robot's usual offsets.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 POOR = (DataError, np.linalg.LinAlgError)  # errors caused by poor data; any other error is a bug
@@ -79,7 +78,7 @@ def aligned(
         calibration = calibrated(recording)
     for _ in range(2):
         step_s, sd_s = clock_error(calibration, seen.rows(recording), recording.kinematics, recording.offset_s)
-        surer = sd_s <= _SURER * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan with few pairs gives no sd
+        surer = sd_s <= 1.1 * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan with few pairs gives no sd
         if np.isinf(sd_s) or not surer:
             break
         clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
