@@ -335,15 +335,11 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
         raise ValueError(f"{path}: no row holds {landmarks[0]} and one more; log {', '.join(landmarks)} in each row.")
-    reach_mm = float(np.nanmedian(reach))
-    if not 0.25 <= reach_mm <= 100:  # a jaw or shaft in metres, inches or micrometres falls outside
-        own_mm = [float(np.median(r[np.isfinite(r)])) if np.isfinite(r).any() else np.nan for r in reach.T]
-        far = [name for name, r in zip(landmarks[1:], own_mm, strict=True) if not 0.25 <= r <= 100]
-        told = ", ".join(f"{r:.4g} to {name}" for name, r in zip(landmarks[1:], own_mm, strict=True))
-        cure = "Metres, inches or micrometres? Convert to mm"
-        cure = f"Check the columns of {', '.join(far)}" if len(far) < len(own_mm) else cure
+    if not 0.25 <= np.nanmedian(reach) <= 100:  # a jaw or shaft in metres, inches or micrometres falls outside
+        each = zip(landmarks[1:], np.ma.median(np.ma.masked_invalid(reach), axis=0).filled(np.nan), strict=True)
+        told = ", ".join(f"{reach_mm:.4g} to {name}" for name, reach_mm in each)
         what = f"the median distances from {landmarks[0]} are {told}, not plausible in mm (0.25 to 100)"
-        raise ValueError(f"{path}: {what}. {cure}.")
+        raise ValueError(f"{path}: {what}. Check the columns. Metres, inches or micrometres? Convert to mm.")
     return Kinematics(time_s, x)
 
 

@@ -319,7 +319,7 @@ SPOILT = {
         r"\(lengths vary from 1 to 2; .* normalise them\)\. Check rot"),
     "a tip elsewhere": (edit("log.csv", lambda t: _scaled(t, 100, column=4)),
         r"log\.csv, read with .*map\.toml: the median distances from base are \d+ to tip_1, [23]\.\d+ to tip_2, "
-        r"not plausible in mm \(0\.25 to 100\)\. Check the columns of tip_1\."),
+        r"not plausible in mm \(0\.25 to 100\)\. Check the columns\."),
     "an empty landmark": (edit("log.csv", lambda t: re.sub(r"(?m)^(-?\d.*)(,[^,]*){3}$", r"\1,,,", t)),
         r"log\.csv: no row has a value in tip_2_x, tip_2_y, tip_2_z\. Name other columns"),
     "degrees called radians": (pose(old='gripper_unit = "deg"', new='gripper_unit = "rad"'),
