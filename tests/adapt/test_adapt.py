@@ -322,7 +322,7 @@ def test_a_base_that_only_follows_the_robot_teaches_nothing(world, tmp_path, mon
     monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
     record = world.record(tmp_path / "lab", robot=longer)
     found = adapt(record, Follows(world.u, noise_px=0.7), folder=tmp_path / "out", progress=False, tune=tune)
-    assert ("in whole images it sees the base" if shift else "training starts") in found.report["reason"]
+    assert ("it marks another point than the base" if shift else "training starts") in found.report["reason"]
 
 
 @pytest.mark.parametrize(
