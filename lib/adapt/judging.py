@@ -85,12 +85,13 @@ def check_base(teacher: Teacher, seen: Seen, end: ShaftEnd | None) -> None:
     ends = np.nan if end is None else float(np.nanmedian(_from_base(teacher, end.frame, end.u)[0]))
     if len(shift) < _FEWEST or abs(ends) <= CONFIRMED:
         return
-    apart, where = float(np.median(shift)), "whole images"
+    apart, also = float(np.median(shift)), ""
     if (np.abs(shift - ends) < _SAME).sum() > (np.abs(shift) < _SAME).sum():
-        apart, where = ends, "many whole images, and in the aligned ones the end of the shaft,"
+        apart, also = ends, ", and there the aligned images show the end of the shaft"
     elif abs(apart) <= _APART:
         return
-    what = f"in {where} it sees the base {100 * abs(apart):.0f} % of the tool's length from where robot and images place it"
+    what = f"in whole images it sees the base {100 * abs(apart):.0f} % of the tool's length"
+    what += f" from where robot and images place it{also}"
     raise RefusalError(f"detector: {what}. It marks another point there, or the robot's tool has other dimensions. {LABEL}")
 
 

@@ -51,8 +51,8 @@ class Calibration:
             pose errs alike in all of them).  The covariances allow for this and for estimated noise.
         detector_scale: Factor, 1 or more, on the detector's standard deviations; `covariance_px2` includes it.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
-        not_shown: (q + 1,) the 1/distance in 1/mm that affine cameras may have without showing it here, one standard
-            deviation, behind the parameters that follow it; None if it was not asked (`calibrate_as_shown` does).
+        not_shown: (q + 1,) one standard deviation of what affine cameras leave unknown: the changes of the parameters of
+            `joint_covariance`, then the 1/distance in 1/mm that causes them.  None unless by `calibrate_as_shown`.
     """
 
     minimum: Minimum

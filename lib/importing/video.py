@@ -10,7 +10,6 @@ from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
 
 import av
-import cv2
 import numpy as np
 from PIL import Image
 from scipy.spatial import KDTree
@@ -19,8 +18,7 @@ from lib.importing.logs import exact_seconds, increasing, read_columns, since
 from lib.importing.mapping import Video
 from lib.recordings import read_image, to_8_bits
 
-_TIFF = (".tif", ".tiff")
-IMAGES = (".png", ".jpg", ".jpeg", *_TIFF, ".bmp")
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
 _STEP_S = 1e-4, 60.0  # plausible median step of frames; outside this range the unit of time must be wrong
 _DEPTH_SAMPLES = 12  # number of frames in which the brightest value is searched
@@ -82,11 +80,7 @@ class _Images:
         return len(self.files)
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        for path in (self.files[index] for index in wanted):
-            image = read_image(path, bit_depth=None)
-            if path.suffix.lower() not in _TIFF and _orientation(path) > 1:  # OpenCV turns a TIFF in any case
-                image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
-            yield image
+        return (read_image(self.files[index], bit_depth=None, upright=True) for index in wanted)
 
 
 def _orientation(path: Path) -> int:

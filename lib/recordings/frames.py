@@ -27,12 +27,15 @@ class StereoFrame:
     time_s: float
 
 
-def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int | None = 0) -> np.ndarray:
-    """Read an image file, colour or grey, as (h, w, 3) uint8 RGB.  An EXIF orientation is ignored, except in a TIFF.
+def read_image(
+    path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int | None = 0, *, upright: bool = False
+) -> np.ndarray:
+    """Read an image file, colour or grey, as (h, w, 3) uint8 RGB.  OpenCV turns a TIFF by its EXIF orientation.
 
     Args:
         image_size_px: Required (width, height).
         bit_depth: Number of bits that a 16-bit image uses, as in `to_8_bits`; None returns uint16.
+        upright: Turn a JPEG or PNG by its EXIF orientation, too.
 
     Raises a ValueError if the image cannot be decoded, if a part of it is lost, or if it has another size.
     """
@@ -41,7 +44,7 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
     data = path.read_bytes()  # not cv2.imread: it fails on non-ASCII paths on some systems
     if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
         raise ValueError(f"{path}: the image is corrupt; a block of zeros replaces a part of it. Export it again.")
-    image, flags = None, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image, flags = None, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
     with suppress(cv2.error):  # raised for more pixels than OpenCV allows, and for no data
         image = cv2.imdecode(coded := np.frombuffer(data, np.uint8), flags)
         if path.suffix.lower() in (".tif", ".tiff") and cv2.imdecodemulti(coded, flags, range=(1, 2))[0]:

@@ -329,9 +329,9 @@ def test_a_base_that_only_follows_the_robot_teaches_nothing(world, tmp_path, mon
     ("rings", "taught_at", "shaft_ends", "reason"),
     [
         (15, 0.0, 0.0, ""),
-        (15, 0.0, None, "in whole images it sees the base 28 %"),
-        (15, 0.0, -0.28, "the end of the shaft, it sees the base 28 %"),
-        (10, -0.08, 0.08, "the end of the shaft, it sees the base 7 %"),  # the median of the detections is near this base
+        (15, 0.0, None, "in whole images it sees the base 28 % .* place it. It marks"),
+        (15, 0.0, -0.28, "it sees the base 28 % .* and there the aligned"),
+        (10, -0.08, 0.08, "it sees the base 7 % .* and there the aligned"),  # the median is near this base
         (10, -0.08, None, ""),  # which may be the robot's
     ],
 )
