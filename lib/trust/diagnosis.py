@@ -33,6 +33,8 @@ _SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
 #: Least share of gross errors of an unfit detector: in all landmarks, or in one that has at least so many detections.
 _UNFIT_SHARE, _UNFIT_ONE, _UNFIT_FEWEST = 0.2, 0.35, 16
+#: Least share of gross errors in the images of one eye, and largest share in the other's, if only the one's are in doubt.
+_ONE_EYE, _OTHER_EYE = 0.6, 0.2
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
@@ -268,7 +270,16 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
             return []
         what = f"{100 * max(wrong):.0f} % of the detections of {LANDMARKS[int(np.argmax(wrong))]}"
         text = f"{what} lie more than 5 % of the tool's length from where the cameras see it."
-    return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
+    name, cure, images = "detector_unfit", _UNFIT, (0, 1)
+    low, high = np.sort(of_eye := far.sum(axis=0) / np.maximum(problem.used.sum(axis=0), 1))
+    if low < _OTHER_EYE and high > _ONE_EYE:
+        side, other = (SIDES[k] for k in np.argsort(-of_eye))
+        name, images = "frame_order", (SIDES.index(side),)
+        text = f"In the {side} images {100 * high:.0f} % of the landmarks lie more than 5 % of the tool's length from where "
+        text += f"the cameras see them, in the {other} images {100 * low:.0f} %."
+        cure = f"Are the {side} images of this recording, and each of the same instant as the {other} one? Else pair them "
+        cure += f"again. If they are: {_UNFIT}"
+    return [Hypothesis(name, text, cure, 100 * share, 0.0, "%", share, float(gain), images)]
 
 
 def _prefer_simple(found: list[Hypothesis]) -> list[Hypothesis]:

@@ -238,6 +238,16 @@ def test_an_image_that_one_camera_lost_is_named():
     assert best.name == "frame_order" and "of the right images" in best.text and "+67 ms from those stated" in best.text
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_images_of_another_recording_in_one_eye_are_told_from_an_unfit_detector(side):
+    usual, other = take(frames=60), take(frames=60, seed=5)
+    assert not np.allclose(usual.data.u_left, other.data.u_left, atol=50.0)
+    data = replace(usual.data, **{f"u_{side}": getattr(other.data, f"u_{side}")})
+    best = found(replace(usual, data=data)).best
+    assert best.name == "frame_order" and best.images == (("left", "right").index(side),)
+    assert best.text.startswith(f"In the {side} images") and f"Are the {side} images of this recording" in best.cure
+
+
 @pytest.mark.parametrize(("share", "told"), [(0.45, True), (0.2, False)])
 def test_a_base_that_is_often_marked_elsewhere_is_told(share, told):
     """At a ring on the shaft, 28 % of the tool's length behind its end.  The cameras hardly suffer from it."""

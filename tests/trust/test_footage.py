@@ -57,6 +57,29 @@ def test_a_log_that_never_turns_the_tool_is_named(recording, cause):
     assert named(recording, cause, noisy).name == cause.name
 
 
+@pytest.mark.parametrize("cause", [CLOCK, None])
+@pytest.mark.parametrize(("code", "how"), [(0, "top to bottom"), (1, "left to right"), (-1, "by 180 degrees")])
+def test_images_of_an_eye_that_are_turned_in_some_frames_are_named(recording, code, how, cause):
+    late, images = len(recording) - 5, [frame.left for frame in recording.frames]
+    turned = [cv2.flip(image, code) for image in images]
+
+    def with_right(right):
+        return replace(recording, frames=Frames(images.__getitem__, right.__getitem__, recording.frames.time_s))
+
+    data = of_recording(recording, recording.truth.u_left, recording.truth.u_right)
+    before = Diagnosis((cause,) if cause else ())
+    best = with_footage(before, with_right(images[:late] + turned[late:]), data).best
+    assert best.name == "turned_images" and best.images == (1,) and how in best.text
+    assert f"5 of the right images, first in frame {late}, last in frame {late + 4}," in best.text
+    assert with_footage(before, with_right(turned), data).best is cause  # all of them: other tests find that
+
+
+def test_a_picture_that_looks_alike_when_turned_is_not_turned(recording):
+    y, x = np.mgrid[-1:1:108j, -1:1:192j]
+    rings = np.uint8(127 + 100 * np.cos(30 * np.hypot(x, y)))[..., None].repeat(3, axis=2)
+    assert named(recording, CLOCK, lambda images: [rings] * len(images)).name == CLOCK.name
+
+
 def test_detections_that_turn_in_one_image_only_accuse_no_log(recording):
     x_mm = recording.kinematics.x_mm
     still = replace(recording, kinematics=replace(recording.kinematics, x_mm=x_mm[:, :1] + x_mm[:1] - x_mm[:1, :1]))
