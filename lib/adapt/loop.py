@@ -38,6 +38,7 @@ from lib.recordings.annotations import CLICK_SD_PX, read_coco
 from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
+from lib.trust.footage import turned_images
 from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
@@ -161,13 +162,12 @@ class _Work:
         self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.learns = isinstance(self.detector, Detector)  # other callables have no networks
         self.looks_near = self.learns and bool(self.detector.closeup_network)
-        key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
-        key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
-        key += [recording.robot_accuracy_mm]
-        shown = (recording.frames[int(i)] for i in self.frames[::12])  # changed images in the same folder need new work
-        key += [recording.kinematics.time_s.tobytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in shown)]
         digest = getattr(self.detector, "digest", "")  # of the detector that learns
-        key += [digest, Path(labels).read_bytes() if labels is not None else b""]
+        arrays = recording.kinematics.x_mm, recording.kinematics.time_s, recording.frames.time_s, self.frames
+        key = [str(recording.folder.resolve()), digest, *(array.tobytes() for array in arrays)]
+        key += [RECIPE, STEPS, seed, minutes, recording.offset_s, recording.readout_s, recording.robot_accuracy_mm]
+        pairs = (recording.frames[int(i)] for i in self.frames[::12])  # changed images in the same folder need new work
+        key += [labels and Path(labels).read_bytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in pairs)]
         self.folder = work_folder(folder, recording.name, key)
         self.folder.mkdir(parents=True, exist_ok=True)
         state = self.folder / "state.json"
@@ -225,8 +225,9 @@ class _Work:
     def adapted(self) -> Adaptation:
         """Teach, train and detect again, in rounds, then judge."""
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
-        first = self.look("before", start, self.frames)
-        seen = self.moving(first, start)
+        if turned := turned_images(recording, self.frames):
+            raise RefusalError(f"images: {turned.text} {turned.cure}")
+        seen = self.moving(first := self.look("before", start, self.frames), start)
         nothing = np.full_like(self.labels, np.nan)
         still, note = longest_still(recording, seen.labelled(self.labels if len(self.marked) < _OVERRULE else nothing))
         self.report["notes"] += [note] if note else []

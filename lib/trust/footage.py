@@ -45,7 +45,7 @@ def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondenc
 
     Most look like wrong times.  A log that never turns the tool, and turned images, may look like anything.
     """
-    if turned := _turned_images(recording, np.unique(data.frame)):  # then no other cause matters
+    if turned := turned_images(recording, np.unique(data.frame)):  # then no other cause matters
         most = max((h.gain for h in diagnosis.hypotheses), default=0.0)
         return Diagnosis((replace(turned, gain=turned.gain + max(most, 0.0)), *diagnosis.hypotheses))
     best = diagnosis.best
@@ -56,21 +56,6 @@ def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondenc
         found = found or _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
         found = found or _rounded_log(best, recording)
     return Diagnosis((found, *(h for h in diagnosis.hypotheses if h.name != best.name))) if found else diagnosis
-
-
-def _turned_images(recording: Recording, frames: np.ndarray) -> Hypothesis | None:
-    """Images of one eye that show the scene mirrored or turned by 180 degrees, unlike most of its images."""
-    some = frames[spread(len(frames), _LOOKED_FOR_TURNS)]
-    usual = np.median([_reduced(recording, i) for i in some], axis=0)
-    if not any(_turned(recording, i, usual) for i in some):
-        return None
-    found = [(int(i), *turned) for i in frames if (turned := _turned(recording, i, usual))]
-    side, code = found[0][1:]
-    numbers = [i for i, *turned in found if turned == [side, code]]
-    text = f"{len(numbers)} of the {SIDES[side]} images, first in frame {numbers[0]}, last in frame {numbers[-1]}, are "
-    text += f"{_TURNS_BACK[code]} relative to the others."
-    cure = "Turn them back, or leave out these frames (--frames A:B)."
-    return Hypothesis("turned_images", text, cure, float(len(numbers)), 0.0, "images", 1.0, float(len(frames)), (side,))
 
 
 def _turned(recording: Recording, frame: int, usual: np.ndarray) -> tuple[int, int] | None:
@@ -120,6 +105,21 @@ def _frozen_orientation(best: Hypothesis, recording: Recording, data: Correspond
     cure = "Does the orientation in the robot's log stand still? Or are the positions in the tool's own axes?"
     size = {"value": float(np.degrees(seen)), "sd": 0.0, "unit": "degrees", "images": (0, 1)}
     return replace(best, name="frozen_orientation", text=text, cure=cure, **size)
+
+
+def turned_images(recording: Recording, frames: np.ndarray) -> Hypothesis | None:
+    """Images of one eye that show the scene mirrored or turned by 180 degrees, unlike most of its images."""
+    some = frames[spread(len(frames), _LOOKED_FOR_TURNS)]
+    usual = np.median([_reduced(recording, i) for i in some], axis=0)
+    if not any(_turned(recording, i, usual) for i in some):
+        return None
+    found = [(int(i), *turned) for i in frames if (turned := _turned(recording, i, usual))]
+    side, code = found[0][1:]
+    numbers = [i for i, *turned in found if turned == [side, code]]
+    text = f"{len(numbers)} of the {SIDES[side]} images, first in frame {numbers[0]}, last in frame {numbers[-1]}, are "
+    text += f"{_TURNS_BACK[code]} relative to the others."
+    cure = "Turn them back where the images are stored, or leave these frames out."
+    return Hypothesis("turned_images", text, cure, float(len(numbers)), 0.0, "images", 1.0, float(len(frames)), (side,))
 
 
 def blurred(recording: Recording, frames: np.ndarray) -> list[Doubt]:

@@ -456,6 +456,17 @@ def test_other_images_in_the_same_folder_are_other_work(world, recording, tmp_pa
     assert len(list((tmp_path / "work").iterdir())) == 3
 
 
+def test_images_that_are_turned_in_some_frames_teach_nothing(world, recording, tmp_path):
+    """Their labels would be those of images that are not turned."""
+    scene = np.random.default_rng(0).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
+    scene = cv2.GaussianBlur(scene, (0, 0), 8.0)
+    frames = Kept(world.time_s)
+    frames._pairs = [(scene, scene[::-1] if i >= 28 else scene) for i in range(world.n)]
+    asked = StandIn(world.u)
+    done = adapt(replace(recording, frames=frames), asked, folder=tmp_path, progress=False)
+    assert not done.improved and "of the right images, first in frame 28" in done.report["reason"]
+
+
 class Sure(StandIn):
     """Is sure of the lost landmarks, too."""
 
