@@ -38,21 +38,17 @@ NO_CONSENSUS_CURE = "check that x_mm and u belong together (frames, landmarks, c
 class NoConsensusError(DataError):
     """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
 
-
-class LooseCameraError(NoConsensusError):
-    """Most rows agree on one camera, but loosely, by `sigma_px`; constant offsets of the landmarks may be the reason."""
-
     def __init__(self, text: str, sigma_px: float = np.nan) -> None:  # a process that gets it sets the number later
         super().__init__(text)
         self.sigma_px = sigma_px
 
 
+class LooseCameraError(NoConsensusError):
+    """Most rows agree on one camera, but loosely, by `sigma_px`; constant offsets of the landmarks may be the reason."""
+
+
 class CompetingCamerasError(NoConsensusError):
     """Some rows agree on one camera, by `sigma_px`, and as many others on another one."""
-
-    def __init__(self, text: str, sigma_px: float = np.nan) -> None:
-        super().__init__(text)
-        self.sigma_px = sigma_px
 
 
 def gate(n: int) -> float:
