@@ -64,12 +64,16 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
     return tensors, metadata
 
 
+def with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `prefix`, without it in their names."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
 def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = "") -> Network:
     """Make the network of a configuration, with the tensors whose names begin with `prefix`; error messages name `path`."""
     try:
         network = network_of((OffsetConfig if "size_px" in config else HourglassConfig)(**config))
-        own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        network.load_state_dict(own)
+        network.load_state_dict(with_prefix(tensors, prefix))
     except (TypeError, RuntimeError, ValueError) as error:
         text = str(error).splitlines()[0]
         raise ValueError(f"{path}: its weights do not fit its configuration ({text}); {_CURE}") from error

@@ -355,8 +355,7 @@ class Detector:
         """
         u, height, one = [], [], image[None]
         for scale in _SCALES:
-            heatmaps = self.outputs(self.reduced(one, scale), "frame")
-            at, value = several_peaks(heatmaps, PEAKS, self.frame_network.stride)
+            at, value = several_peaks(self.outputs(self.reduced(one, scale), "frame"), PEAKS, self.frame_network.stride)
             u.append(image_from_cell(at, self.frame_stride(one, scale)))
             height.append(value)
         u, height = np.concatenate(u), np.concatenate(height)
@@ -405,10 +404,11 @@ class Detector:
         result = Landmarks.join([rough])  # a copy
         # While tracking, the previous frame's result is no evidence.
         before = None if stage in ("frame", "tracking") else Rough.in_windows(rough.u, rough.confidence, matrices, which)
-        fine = self._measured(peaks, before, stage, which[:, 1:])
-        u, back = view.unmapped(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
-        covariance = back @ fine.covariance[:, 0] @ back.mT
-        confidence = fine.confidence[:, 0]
+        fit = self.error_models.get(stage, ErrorModel())
+        fine = covariance_and_confidence(peaks.double(), before, fit, which[:, 1:])  # in pixels of the stage's input
+        own, confidence = (part[:, 0].numpy() for part in fine)
+        u, back = view.unmapped(matrices, peaks.u[:, 0].numpy()), np.linalg.inv(matrices[:, :, :2])
+        covariance = back @ own @ back.mT
         if stage in CLOSE:
             near = peaks.value[:, 0].numpy() > 0
             confidence = np.where(near, confidence, 0.0)
@@ -491,9 +491,3 @@ class Detector:
             half = tuple(side // 2 for side in images.shape[2:0:-1])
             images = [cv2.resize(image, half, interpolation=method) for image in images]
         return np.stack([cv2.resize(image, size, interpolation=method) for image in images])
-
-    def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray) -> Landmarks:
-        """Convert peaks to landmarks in pixels of the stage's input; `landmark` is the index of each peak's landmark."""
-        fit = self.error_models.get(stage, ErrorModel())
-        covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
-        return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())

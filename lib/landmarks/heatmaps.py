@@ -88,6 +88,12 @@ def disc_mean(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
     return cell.to(heatmaps.dtype) + (weights @ offsets) / total.clamp_min(torch.finfo(total.dtype).tiny), value
 
 
+def distances2(heatmaps: Tensor, u: Tensor) -> Tensor:
+    """Squared distances (n, k, h, w) of the cells of heatmaps from points u (n, k, 2), in cells."""
+    rows, columns = (torch.arange(side, dtype=u.dtype, device=u.device) for side in heatmaps.shape[-2:])
+    return (columns - u[..., None, :1]) ** 2 + (rows[:, None] - u[..., None, 1:]) ** 2
+
+
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve matrix (..., n, n) X = right for X (..., n, m); the matrix must be positive definite."""
     if not torch.onnx.is_in_onnx_export():
@@ -142,8 +148,7 @@ def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) 
     residual, jacobian = model(theta)
     variance = residual.square().sum(-1) / (weight.sum(-1) - 5).clamp_min(1) + 1e-8
     normal = jacobian.transpose(-1, -2) @ jacobian + 1e-6 * eye
-    unit = eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)
-    covariance = variance[..., None, None] * _solve(normal, unit)[..., :2, :]
+    covariance = variance[..., None, None] * _solve(normal, eye[:, :2].expand(*jacobian.shape[:-2], 5, 2))[..., :2, :]
     width = theta[..., 2]
     near = (theta[..., :2].square().sum(-1) <= reach**2) & (width > 0.4) & (width < 2.5)
     good = near & (theta.abs() < torch.inf).all(-1) & (theta[..., 3] > 0)  # NaN is not good
@@ -175,8 +180,7 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     width, covariance = torch.ones_like(value), torch.full_like(u[..., None, :].expand(*u.shape, 2), torch.nan)
     if method == "gauss_newton":
         u, width, covariance = _gauss_newton(heatmaps, sigma, u, value)
-    rows, columns = (torch.arange(n, dtype=u.dtype, device=u.device) for n in heatmaps.shape[-2:])
-    far = (rows[:, None] - u[..., 1, None, None]) ** 2 + (columns - u[..., 0, None, None]) ** 2 > (3 * sigma) ** 2
+    far = distances2(heatmaps, u) > (3 * sigma) ** 2
     rival = torch.where(far, heatmaps, torch.zeros_like(heatmaps)).flatten(-2).amax(-1)
     u_px = stride * u + (stride - 1) / 2  # as `lib.geometry.image_from_cell`
     return Peaks(*(part.to(heatmaps.dtype) for part in (u_px, value, width, covariance * stride**2, rival)))

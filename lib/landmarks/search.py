@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lib.landmarks.heatmaps import SIGMA_PX, disc_mean, sigma_cells
+from lib.landmarks.heatmaps import SIGMA_PX, disc_mean, distances2, sigma_cells
 from lib.landmarks.metrics import tool_length_px
 
 #: Number of peaks taken from each heatmap.
@@ -19,7 +19,7 @@ def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarr
     sigma, found = sigma_cells(stride, SIGMA_PX), []
     for _ in range(n):
         found.append(disc_mean(heatmaps, sigma))  # accurate enough: the next stage measures in a window
-        heatmaps = heatmaps.masked_fill(_apart2(heatmaps, found[-1][0]) < (3 * sigma) ** 2, -1.0)
+        heatmaps = heatmaps.masked_fill(distances2(heatmaps, found[-1][0]) < (3 * sigma) ** 2, -1.0)
     u, value = (torch.cat(part) for part in zip(*found, strict=True))
     return (stride * u + (stride - 1) / 2).numpy(), value.numpy()
 
@@ -34,13 +34,7 @@ def near_only(heatmaps: torch.Tensor, u: np.ndarray, reach: float, stride: int) 
     """
     cells = (u - (stride - 1) / 2) / stride
     reach2 = torch.from_numpy((reach * tool_length_px(cells)) ** 2)[:, None, None, None]
-    return heatmaps.masked_fill(_apart2(heatmaps, torch.from_numpy(cells)) > reach2, 0.0)
-
-
-def _apart2(heatmaps: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-    """Squared distances (m, k, h, w) of the cells of heatmaps from points u (m, k, 2), in cells."""
-    rows, columns = (torch.arange(side, dtype=u.dtype) for side in heatmaps.shape[-2:])
-    return (columns - u[..., None, :1]) ** 2 + (rows[:, None] - u[..., None, 1:]) ** 2
+    return heatmaps.masked_fill(distances2(heatmaps, torch.from_numpy(cells)) > reach2, 0.0)
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from tqdm.auto import tqdm
 
 from lib.geometry import check
-from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, with_prefix, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
 from lib.landmarks.metrics import score, tool_length_px
@@ -331,11 +331,11 @@ class Run:
             if differs:
                 raise ValueError(f"{path}: {how} use another folder.")
         provenance |= {key: kept[key] for key in ("initial", "before", "metrics") if key in kept}
-        self.network.load_state_dict(_part(tensors, "network."))
+        self.network.load_state_dict(with_prefix(tensors, "network."))
         if self.average is not None:
-            self.average.load_state_dict(_part(tensors, "average."))
-        parts = ((i, _part(tensors, f"optimiser.{i}.")) for i, _ in enumerate(self.network.parameters()))
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": {i: part for i, part in parts if part}})
+            self.average.load_state_dict(with_prefix(tensors, "average."))
+        own = ((i, with_prefix(tensors, f"optimiser.{i}.")) for i, _ in enumerate(self.network.parameters()))
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": {i: state for i, state in own if state}})
         for weight, values in self.optimiser.state.items():  # the fused optimiser needs the weight's order in memory
             values |= {k: torch.empty_like(weight).copy_(v) for k, v in values.items() if v.shape == weight.shape}
         for name in _STATE:
@@ -414,7 +414,3 @@ def load_training(path: str | Path) -> Training:
     network = load_network(path, metadata["config"]["network"], tensors, prefix).eval()
     more = {"steps": metadata["step"], "seconds": metadata["seconds"], "config": metadata["config"]}
     return Training(network, metadata["log"], metadata["provenance"] | more)
-
-
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
