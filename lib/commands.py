@@ -25,6 +25,7 @@ from lib.landmarks import Detector, SharedDetector, detect
 from lib.matching import RigMisfitError
 from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
+from lib.recordings.tables import write_table
 from lib.registration import register_images
 from lib.surface import Reconstruction, reconstruct, save_map, save_mesh, save_points, surface_mesh
 from lib.surface.reconstruct import AMBIGUOUS
@@ -133,7 +134,10 @@ def main_reconstruct(argv: list[str]) -> int:
         cure = "Others may be wrong, too: compare the surface with the images, or show a texture that does not repeat."
         verdict = Verdict.join([verdict, Verdict((Reason("ambiguous_texture", LEVELS[1], text, cure),))])
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
-    _write_points(out / "points.csv", found)
+    names = ["left_x_px", "left_y_px", "right_x_px", "right_y_px", "x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]
+    sd_mm = np.sqrt(np.diagonal(found.points.covariance_mm2, axis1=1, axis2=2))  # without the cameras' part
+    table = np.hstack([found.u, found.matches.u_right, found.points.x_mm, sd_mm])
+    write_table(out / "points.csv", names, table, [4] * len(names))
     try:
         save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
         save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
@@ -362,14 +366,6 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
         (info := out / f"{prefix}{side}_camera_info.yaml").unlink(missing_ok=True)  # from an earlier run
         if not getattr(camera, "radial_per_px2", 0.0):
             write_ros(camera, info, recording.image_size_px, name=side)
-
-
-def _write_points(path: Path, found: Reconstruction) -> None:
-    sd_mm = np.sqrt(np.diagonal(found.points.covariance_mm2, axis1=1, axis2=2))  # without the cameras' part
-    names = ["left_x_px", "left_y_px", "right_x_px", "right_y_px", "x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]
-    table = np.hstack([found.u, found.matches.u_right, found.points.x_mm, sd_mm])
-    with files.whole(path) as new:
-        np.savetxt(new, table, fmt="%.4f", delimiter=",", header=",".join(names), comments="")
 
 
 def _write_rectified(out: Path, found: Reconstruction, left: np.ndarray, right: np.ndarray) -> None:
