@@ -14,7 +14,7 @@ from lib.correspondences import TRAIN_FURTHER, Correspondences, DataError, NoDet
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Doubt, Frames, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, judge
+from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, footage, judge
 from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies import spoiling
@@ -235,6 +235,7 @@ def stub(monkeypatch):
     monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
     monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
     monkeypatch.setattr(verdicts, "blurred", lambda *_: [])
+    monkeypatch.setattr(footage, "turned_images", lambda *_: None)
     scene = spoiling.Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
     stated = {key: getattr(scene, key) for key in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     recording = MagicMock(folder=Path("stub"), doubts=(), robot_accuracy_mm=0.01, **stated)
