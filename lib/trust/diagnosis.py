@@ -33,7 +33,7 @@ _SURE_CHANGE = 30.0  # least gain in log likelihood by a change of the cameras (
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.06 mm in 4 frames, noise included
 #: Least share of gross errors of an unfit detector: in all landmarks, or in one that has at least so many detections.
 _UNFIT_SHARE, _UNFIT_ONE, _UNFIT_FEWEST = 0.2, 0.35, 16
-#: Least share of gross errors in the images of one eye, and largest share in the other's, if only the one's are in doubt.
+#: Least share of gross errors in the images of one eye, and largest share in the other's, if only the one eye is in doubt.
 _ONE_EYE, _OTHER_EYE = 0.6, 0.2
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
@@ -270,11 +270,11 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
             return []
         what = f"{100 * max(wrong):.0f} % of the detections of {LANDMARKS[int(np.argmax(wrong))]}"
         text = f"{what} lie more than 5 % of the tool's length from where the cameras see it."
-    name, cure, images = "detector_unfit", _UNFIT, (0, 1)
-    low, high = np.sort(of_eye := far.sum(axis=0) / np.maximum(problem.used.sum(axis=0), 1))
-    if low < _OTHER_EYE and high > _ONE_EYE:
+    name, cure, images, each = "detector_unfit", _UNFIT, (0, 1), problem.used.sum(axis=0)
+    low, high = np.sort(of_eye := far.sum(axis=0) / np.maximum(each, 1))
+    if low < _OTHER_EYE and high > _ONE_EYE and each.min() >= _UNFIT_FEWEST:
         side, other = (SIDES[k] for k in np.argsort(-of_eye))
-        name, images = "frame_order", (SIDES.index(side),)
+        name, images = "one_eye_unfit", (SIDES.index(side),)
         text = f"In the {side} images {100 * high:.0f} % of the landmarks lie more than 5 % of the tool's length from where "
         text += f"the cameras see them, in the {other} images {100 * low:.0f} %."
         cure = f"Are the {side} images of this recording, and each of the same instant as the {other} one? Else pair them "

@@ -30,11 +30,11 @@ _COMPARED, _SIZES, _ROUNDED, _BLANK = 12, 3, 1e-3, 1e-4
 #: recordings, of which some have unlike cameras, the lower of both shares was 0.77 or more.
 _BLURRED, _OFTEN = 0.6, 0.2
 #: Frames in which turned images are looked for; size (width, height) of the reduced images; blur of the shading that is
-#: subtracted, and of the contrast by which is divided, so that the border of a lit field counts little; a faint contrast.
+#: subtracted and of the contrast that divides the rest, so that the border of a lit field counts little; least contrast.
 _LOOKED_FOR_TURNS, _SMALL_PX, _SHADING_PX, _FAINT = 24, (96, 54), 3.0, 0.02
-#: Steps through rows and columns that turn an image back.  It is turned if its correlation with the usual image is then at
-#: least `_ALIKE`, and as it is less than `_UNALIKE` times that.  In 145 recordings without turned images the correlation
-#: after turning was 0.53 or less, and 0.82 or less of that as it is; in a stabilised one 2, at 0.4.
+#: Steps through rows and columns that turn an image back.  It is turned if its correlation with the usual image is then more
+#: than `_ALIKE`, and without turning less than `_UNALIKE` times that.  In 145 recordings without turned images, turning gave
+#: 0.53 or less; where it gave more than 0.4, that was 0.6 or less of the correlation without turning.
 _BACK = {(1, 1): "", (-1, 1): "mirrored top to bottom", (1, -1): "mirrored left to right", (-1, -1): "turned by 180 degrees"}
 _ALIKE, _UNALIKE = 0.5, 0.5
 _UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.5, 0.2, 0.1, 0.05)  # units to which times and positions may be rounded
@@ -90,18 +90,18 @@ def _frozen_orientation(best: Hypothesis, recording: Recording, data: Correspond
 def turned_images(recording: Recording, frames: np.ndarray) -> Hypothesis | None:
     """Images of one eye that show the scene mirrored or turned by 180 degrees, unlike most of its images."""
     some = frames[spread(len(frames), _LOOKED_FOR_TURNS)]
-    usual = _even(np.median([_reduced(recording, i) for i in some], axis=0))
+    reduced = [_reduced(recording, i) for i in some]
+    usual = _even(np.median(reduced, axis=0))
 
-    def turned(frame: int) -> list[tuple[int, str]]:
-        """The sides of a frame that are turned, and how."""
-        own = _reduced(recording, frame)
+    def turned(own: np.ndarray) -> list[tuple[int, str]]:
+        """The sides of a reduced frame that are turned, and how."""
         alike = np.array([(own[:, ::y, ::x] * usual).mean(axis=(1, 2)) for y, x in _BACK])  # (4, 2): the first as they are
         how = np.where((alike.max(axis=0) > _ALIKE) & (alike[0] < _UNALIKE * alike.max(axis=0)), alike.argmax(axis=0), 0)
         return [(side, list(_BACK.values())[k]) for side, k in enumerate(how) if k]
 
-    if not any(turned(i) for i in some):
+    if not any(map(turned, reduced)):
         return None
-    found = [(int(i), *one) for i in frames for one in turned(i)]
+    found = [(int(i), *one) for i in frames for one in turned(_reduced(recording, i))]
     side, how = found[0][1:]
     numbers = [i for i, *one in found if one == [side, how]]
     text = f"{len(numbers)} of the {SIDES[side]} images, first in frame {numbers[0]}, last in frame {numbers[-1]}, are "

@@ -77,7 +77,7 @@ LOG_DOUBTS = ("repeated_samples", "bursts")  # doubts about the times of the log
 _BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")
 #: Causes of which a refused calibration says less, or something else.
 _KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
-OF_DETECTOR = ("detector_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
+OF_DETECTOR = ("detector_unfit", "one_eye_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"

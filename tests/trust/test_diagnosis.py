@@ -244,7 +244,7 @@ def test_images_of_another_recording_in_one_eye_are_told_from_an_unfit_detector(
     assert not np.allclose(usual.data.u_left, other.data.u_left, atol=50.0)
     data = replace(usual.data, **{f"u_{side}": getattr(other.data, f"u_{side}")})
     best = found(replace(usual, data=data)).best
-    assert best.name == "frame_order" and best.images == (("left", "right").index(side),)
+    assert best.name == "one_eye_unfit" and best.images == (("left", "right").index(side),)
     assert best.text.startswith(f"In the {side} images") and f"Are the {side} images of this recording" in best.cure
 
 
