@@ -73,6 +73,8 @@ _LABEL_PX = 3.0
 #: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
+#: Least share of the images with a landmark, by robot and cameras, in which the detector finds it; and fewest such images.
+_LEAST_FOUND, _FEWEST_SHOWN = 0.5, 16
 LOG_DOUBTS = ("repeated_samples", "bursts")  # doubts about the times of the log, and the named faults that they explain
 _BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")
 #: Causes of which a refused calibration says less, or something else.
@@ -351,7 +353,9 @@ def assess(
         left, right = calibration.cameras
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
+    missed = []
     if calibration is not None:
+        missed = _missed(data, calibration, recording.image_size_px)
         straight = data = _in_view(data, calibration, recording.image_size_px)
     if near:
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
@@ -364,8 +368,8 @@ def assess(
         shaft = _shaft(recording, data, calibration)  # faults of the robot would blur the aligned images
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
-        robot_accuracy_mm=recording.robot_accuracy_mm, doubts=[*recording.doubts, *blurred(recording, np.unique(data.frame))],
-        epipolar_at_mm=at_mm, shaft=shaft,
+        robot_accuracy_mm=recording.robot_accuracy_mm, epipolar_at_mm=at_mm, shaft=shaft,
+        doubts=[*recording.doubts, *blurred(recording, np.unique(data.frame)), *missed],
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if len(recording) < FEWEST_TO_TRAIN:  # `adapt` would refuse them
@@ -378,6 +382,18 @@ def assess(
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
+
+
+def _missed(data: Correspondences, c: Calibration, size_px: tuple[int, int]) -> list[Doubt]:
+    """The doubt that the detector hardly finds a landmark in the images in which robot and cameras place it."""
+    told_px = np.stack(c.pair.project(data.x_mm), axis=1)
+    shown = ((told_px >= 0) & (told_px <= np.array(size_px) - 1)).all(axis=2)
+    each = [shown & (data.landmark == k)[:, None] for k in range(len(LANDMARKS))]
+    found = np.array([data.seen[own].mean() if own.sum() >= _FEWEST_SHOWN else 1.0 for own in each])
+    if data.is_by_hand or found.min() >= _LEAST_FOUND:
+        return []
+    what = f"{LANDMARKS[found.argmin()]} in only {100 * found.min():.0f} % of the images that should show it"
+    return [Doubt("missed", f"The detector finds {what}.", f"It may not know this tool. {_OVERLAYS}, then {TRAIN_FURTHER}.")]
 
 
 def _in_view(data: Correspondences, c: Calibration, size_px: tuple[int, int]) -> Correspondences:

@@ -251,6 +251,21 @@ def test_what_is_found_while_the_robot_holds_the_tool_outside_the_images_is_no_f
     assert found.diagnosis.best is None and np.array_equal(found.data.seen.any(axis=1), ~away)
 
 
+@pytest.mark.parametrize(("share", "outside", "told"), [(0.7, False, True), (0.3, False, False), (0.7, True, False)])
+def test_a_landmark_that_is_hardly_ever_found_is_told(stub, share, outside, told):
+    """The cameras hardly need it, but a tip that is never found has no distance."""
+    scene, recording, _ = stub
+    lost = (np.random.default_rng(0).random(len(scene.data)) < share) & (scene.data.landmark == 1)
+    aside_mm = np.where(lost[:, None] & outside, 40.0, 0.0) * ROBOT_FROM_MICROSCOPE.R[:, 0]
+    u_left, u_right = (np.where(lost[:, None], np.nan, u) for u in (scene.data.u_left, scene.data.u_right))
+    data = replace(scene.data, u_left=u_left, u_right=u_right, x_mm=scene.data.x_mm + aside_mm)
+    reasons = {reason.name: reason for reason in assess(recording, data).verdict.reasons}
+    assert ("missed" in reasons) == told
+    if told:
+        assert reasons["missed"].level == LEVELS[1] and "finds tip_1 in only" in reasons["missed"].text
+        assert "let the robot teach it" in reasons["missed"].cure
+
+
 def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(stub):
     scene, recording, stated = stub
     centre = (np.array(scene.image_size_px) - 1) / 2
