@@ -37,6 +37,7 @@ _LOOKED_FOR_TURNS, _SMALL_PX, _SHADING_PX, _FAINT = 24, (96, 54), 3.0, 0.02
 #: 0.53 or less; where it gave more than 0.4, that was 0.6 or less of the correlation without turning.
 _BACK = {(1, 1): "", (-1, 1): "mirrored top to bottom", (1, -1): "mirrored left to right", (-1, -1): "turned by 180 degrees"}
 _ALIKE, _UNALIKE = 0.5, 0.5
+_CERTAIN = 100.0  # gain in log likelihood of what the images show without any fit
 _UNITS_S, _UNITS_MM = (1.0, 0.1, 0.01), (1.0, 0.5, 0.2, 0.1, 0.05)  # units to which times and positions may be rounded
 #: Angles of the tool from its mean direction (medians over the frames, rad): the largest in a log that never turns the tool,
 #: and the least in images that show it turn.  The two images' angles may differ by this share.  And the fewest frames.
@@ -46,11 +47,8 @@ _TURNS, _SHOWN_TURNS, _UNLIKE, _FEWEST_TURNS = np.radians(1.0), np.radians(8.0),
 def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondences) -> Diagnosis:
     """The diagnosis of `data`, in which a defect of images or tables takes the place of the cause that it looks like.
 
-    Most look like wrong times.  A log that never turns the tool, and turned images, may look like anything.
+    Most look like wrong times.  A log that never turns the tool may look like anything.
     """
-    if turned := turned_images(recording, np.unique(data.frame)):  # then no other cause matters
-        most = max((h.gain for h in diagnosis.hypotheses), default=0.0)
-        return Diagnosis((replace(turned, gain=turned.gain + max(most, 0.0)), *diagnosis.hypotheses))
     best = diagnosis.best
     if best is None:
         return diagnosis
@@ -107,7 +105,7 @@ def turned_images(recording: Recording, frames: np.ndarray) -> Hypothesis | None
     text = f"{len(numbers)} of the {SIDES[side]} images, first in frame {numbers[0]}, last in frame {numbers[-1]}, are "
     text += f"{how} relative to the others."
     cure = "Turn them back where the images are stored, or leave these frames out."
-    return Hypothesis("turned_images", text, cure, float(len(numbers)), 0.0, "images", 1.0, float(len(frames)), (side,))
+    return Hypothesis("turned_images", text, cure, float(len(numbers)), 0.0, "images", 1.0, _CERTAIN, (side,))
 
 
 def _reduced(recording: Recording, frame: int) -> np.ndarray:

@@ -17,10 +17,11 @@ from lib.correspondences import FEWEST_TO_TRAIN, LANDMARKS, TRAIN_FURTHER, Corre
 from lib.landmarks import Detector, detect
 from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
+from lib.recordings.annotations import inside
 from lib.trust.clocks import PAIR_AGAIN
 from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
 from lib.trust.fitting import SIDES
-from lib.trust.footage import blurred, with_footage
+from lib.trust.footage import blurred, turned_images, with_footage
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.optics import SURE_CURVED
 
@@ -78,7 +79,9 @@ _LEAST_FOUND, _FEWEST_SHOWN = 0.5, 16
 LOG_DOUBTS = ("repeated_samples", "bursts")  # doubts about the times of the log, and the named faults that they explain
 _BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")
 #: Causes of which a refused calibration says less, or something else.
-_KNOWS_BETTER = ("mirrored_axis", "exchanged_eyes", "turned_image", "mirrored_images", "mixed_units", "same_images")
+_KNOWS_BETTER = (
+    "mirrored_axis", "exchanged_eyes", "turned_image", "turned_images", "mirrored_images", "mixed_units", "same_images",
+)  # fmt: skip
 OF_DETECTOR = ("detector_unfit", "one_eye_unfit", "bad_landmark", "bad_stretch")  # causes that may be the detector's
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
@@ -362,6 +365,8 @@ def assess(
     near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
     diagnosis = with_footage(with_scene(diagnosis, recording, data.frame), recording, data)
+    if turned := turned_images(recording, np.unique(data.frame)):  # they look like many causes, and none of these matters
+        diagnosis = Diagnosis((turned,))
     found = health(recording, data, calibration, detector=detector)
     shaft, best = None, diagnosis.best
     if detector is not None and calibration is not None and (best is None or best.name in ("landmark_offset", *OF_DETECTOR)):
@@ -378,16 +383,15 @@ def assess(
     if data.is_by_hand:
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        by_labels = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
+        by_labels = ("detector_unfit", "one_eye_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
 
 
 def _missed(data: Correspondences, c: Calibration, size_px: tuple[int, int]) -> list[Doubt]:
-    """The doubt that the detector hardly finds a landmark in the images in which robot and cameras place it."""
-    told_px = np.stack(c.pair.project(data.x_mm), axis=1)
-    shown = ((told_px >= 0) & (told_px <= np.array(size_px) - 1)).all(axis=2)
+    """The doubt that the detector finds a landmark in few of the images in which robot and cameras place it."""
+    shown = inside(np.stack(c.pair.project(data.x_mm), axis=1), size_px)
     each = [shown & (data.landmark == k)[:, None] for k in range(len(LANDMARKS))]
     found = np.array([data.seen[own].mean() if own.sum() >= _FEWEST_SHOWN else 1.0 for own in each])
     if data.is_by_hand or found.min() >= _LEAST_FOUND:

@@ -14,7 +14,7 @@ from lib.correspondences import TRAIN_FURTHER, Correspondences, DataError, NoDet
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Doubt, Frames, Recording, Scene
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, footage, judge
+from lib.trust import LEVELS, Diagnosis, Health, Hypothesis, Reason, Verdict, assess, diagnose, judge
 from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies import spoiling
@@ -235,7 +235,7 @@ def stub(monkeypatch):
     monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
     monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
     monkeypatch.setattr(verdicts, "blurred", lambda *_: [])
-    monkeypatch.setattr(footage, "turned_images", lambda *_: None)
+    monkeypatch.setattr(verdicts, "turned_images", lambda *_: None)
     scene = spoiling.Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
     stated = {key: getattr(scene, key) for key in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     recording = MagicMock(folder=Path("stub"), doubts=(), robot_accuracy_mm=0.01, **stated)
@@ -249,6 +249,17 @@ def test_what_is_found_while_the_robot_holds_the_tool_outside_the_images_is_no_f
     aside_mm = np.where(away[:, None], 40.0, 0.0) * ROBOT_FROM_MICROSCOPE.R[:, 0]
     found = assess(recording, replace(scene.data, x_mm=scene.data.x_mm + aside_mm))
     assert found.diagnosis.best is None and np.array_equal(found.data.seen.any(axis=1), ~away)
+
+
+def test_turned_images_are_the_only_cause(stub, monkeypatch):
+    scene, recording, _ = stub
+    turned = Hypothesis("turned_images", "20 images are turned.", "Turn them back.", 20.0, 0.0, "images", 1.0, 100.0, (1,))
+    monkeypatch.setattr(verdicts, "turned_images", lambda *_: turned)
+    exchanged = replace(scene.data, u_left=scene.data.u_right, u_right=scene.data.u_left)  # another cause
+    for data in (scene.data, exchanged):
+        found = assess(recording, data)
+        assert found.diagnosis.hypotheses == (turned,) and found.verdict.is_red
+        assert "turned_images" in [reason.name for reason in found.verdict.reasons]
 
 
 @pytest.mark.parametrize(("share", "outside", "told"), [(0.7, False, True), (0.3, False, False), (0.7, True, False)])
