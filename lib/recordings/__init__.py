@@ -10,7 +10,8 @@ from lib.recordings.annotations import Annotations
 from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, encoded, read_image, to_8_bits
 from lib.recordings.ground import Ground, GrowingGround
-from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWriter
+from lib.recordings.kinematics import Kinematics
+from lib.recordings.recording import Doubt, Recording, RecordingWriter
 from lib.recordings.scene import Scene
 from lib.recordings.smoothing import smoothed
 from lib.recordings.truth import Truth

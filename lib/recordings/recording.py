@@ -23,7 +23,8 @@ from lib.files import toml_entries, write_bytes, write_text
 from lib.recordings.annotations import SIDES, Annotations, read_coco, write_coco
 from lib.recordings.frames import Frames, encoded, open_side, video_times
 from lib.recordings.ground import Ground
-from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
+from lib.recordings.kinematics import ORDER, Kinematics, kinematics_columns, read_kinematics
+from lib.recordings.tables import read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
 
 _FORMAT = "microstereo.recording"
@@ -32,10 +33,6 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
-_BRIDGED_S = 0.1 + 1e-6  # the motion is smooth for so long (and rounding): samples dropped within it are interpolated
-_GAP_S = 0.5  # a step between samples that is longer than this and than five usual steps is not interpolated
-_FARTHEST_MM = 1e5  # coordinates beyond this cannot be in millimetres
-_ORDER = "time_s must be a number, larger than in the row before; sort the rows, and delete repeated ones"
 _LONGER = 5.0  # if a log is longer than its video by this factor, the times of the frames may be missing
 _COVERED = 0.75  # fewest frames with a position, as a share; with fewer, log and video do not belong together
 _JUMP_MM = 20.0  # largest plausible move from one sample to the next; no surgical robot is faster
@@ -59,59 +56,7 @@ class Doubt(NamedTuple):
     @property
     def is_of_time(self) -> bool:
         """False if the doubt is about positions or images."""
-        return self.name not in ("jump", "units", "blurred")
-
-
-def _kinematics_columns(landmarks: Sequence[str]) -> list[str]:
-    return ["time_s", *columns(["x_mm", "y_mm", "z_mm"], landmarks)]
-
-
-@dataclass(frozen=True, eq=False)
-class Kinematics:
-    """The robot's report of the landmarks.
-
-    Attributes:
-        time_s: (m,) robot clock, strictly increasing.
-        x_mm: (m, k, 3) the landmarks in the robot frame; NaN where a sample was dropped.
-
-    >>> report = Kinematics(np.array([0.0, 1.0]), np.zeros((2, 3, 3)) + np.array([[[0]], [[4]]]))
-    >>> report.at([0.25, 2.0])[:, 0, 0].tolist()
-    [1.0, nan]
-    """
-
-    time_s: np.ndarray
-    x_mm: np.ndarray
-
-    def at(self, time_s: ArrayLike) -> np.ndarray:
-        """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
-
-        NaN before the first sample, after the last, in steps over 0.5 s and five usual steps, and where samples were dropped
-        for longer than 0.1 s, as between the neighbours of one that was dropped from a slow log.
-        """
-        time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
-        time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
-        if time.ndim != 2 or time.shape[1] != k:
-            raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
-        x, known = np.full((*time.shape, 3), np.nan), time[np.isfinite(time)]
-        # A log may have a million samples, of which a frame needs few.
-        span_s = (known.min() - _BRIDGED_S, known.max() + _BRIDGED_S) if known.size else (0.0, 0.0)
-        low, high = np.searchsorted(self.time_s, span_s)
-        near_s, near_mm = (part[max(low - 2, 0) : high + 2] for part in (self.time_s, self.x_mm))
-        for landmark, at_s in enumerate(time.T):  # exactly on a sample, a dropped neighbour has no effect
-            there = np.flatnonzero(np.isfinite(near_mm[:, landmark]).all(axis=1))
-            own_s, own_mm = near_s[there], near_mm[there, landmark]
-            for axis in range(3 if there.size else 0):
-                x[:, landmark, axis] = np.interp(at_s, own_s, own_mm[:, axis], np.nan, np.nan)
-            if there.size > 1:
-                before = np.clip(np.searchsorted(own_s, at_s, side="right") - 1, 0, there.size - 2)
-                long = np.diff(own_s) > np.where(np.diff(there) > 1, _BRIDGED_S, self._longest_step_s)
-                x[long[before] & (at_s != own_s[before]) & (at_s != own_s[before + 1]), landmark] = np.nan
-        return x
-
-    @cached_property
-    def _longest_step_s(self) -> float:
-        """The longest step between samples, in s, that is interpolated."""
-        return max(_GAP_S, 5.0 * float(np.median(np.diff(self.time_s))))
+        return self.name not in ("jump", "filled", "units", "blurred")
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +120,9 @@ class Recording:
         time_s, path = np.arange(n) / header["fps"], folder / "frames.csv"
         if path.exists():
             time_s = read_table(path, ["frame", "time_s"], n_frames=n)[:, 1]
-            refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
+            refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), ORDER)
         frames = Frames(left, right, time_s)
-        kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
+        kinematics = read_kinematics(folder / "kinematics.csv", skeleton)
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
             seen, logged = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
@@ -216,6 +161,8 @@ class Recording:
         stated = [video_times(path) for path in videos if path.stem in SIDES]
         late_s = max((float(np.abs(t - np.arange(len(t)) / self.fps).max(initial=0)) for t in stated), default=0.0)
         reach_mm = float(np.nanmedian(np.linalg.norm(self.kinematics.x_mm[:, 1:] - self.kinematics.x_mm[:, :1], axis=2)))
+        filled = np.zeros(len(log_s), bool) if self.kinematics.filled is None else self.kinematics.filled
+        filled_s = float(step[filled[1:] | filled[:-1]].sum())
         longer = not own_times and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
         cases = (
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
@@ -236,6 +183,10 @@ class Recording:
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
+            (filled.any(), "filled",
+             f"For {filled_s:.2g} s, first at {log_s[filled.argmax()]:.2f} s, the log is smooth to the last digit, without "
+             "the noise of its other samples: a program filled gaps. These samples are not used.",
+             "Leave the cells of samples that were not measured empty."),
             (reach_mm < _SHORTEST_MM and self.skeleton == LANDMARKS, "units",
              f"The robot reports the tips only {reach_mm:.2g} mm from the base.",
              "Is kinematics.csv in mm? If it is in cm, multiply its positions by 10: all results in mm depend on it."),
@@ -321,26 +272,6 @@ def _read_header(path: Path) -> dict:
             raise ValueError(f"{path}: {problem}.")
     header = {key: float(value) if kinds[key] is float else value for key, value in header.items()}
     return header | {"image_size_px": tuple(size), "skeleton": tuple(names)}
-
-
-def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
-    if not len(table := read_table(path, _kinematics_columns(landmarks))):
-        raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
-    time_s, x = table[:, 0], table[:, 1:].reshape(-1, len(landmarks), 3)
-    empty, far = np.isnan(x), np.abs(np.nan_to_num(x)) > _FARTHEST_MM
-    refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
-    refuse(path, far.any(axis=(1, 2)), f"beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty")
-    problem = "a landmark lacks some coordinates; leave all three cells of a dropped landmark empty"
-    refuse(path, (empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1), problem)
-    reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
-    if not np.isfinite(reach).any():
-        raise ValueError(f"{path}: no row holds {landmarks[0]} and one more; log {', '.join(landmarks)} in each row.")
-    if not 0.25 <= np.nanmedian(reach) <= 100:  # a jaw or shaft in metres, inches or micrometres falls outside
-        each = zip(landmarks[1:], np.ma.median(np.ma.masked_invalid(reach), axis=0).filled(np.nan), strict=True)
-        told = ", ".join(f"{reach_mm:.4g} to {name}" for name, reach_mm in each)
-        what = f"the median distances from {landmarks[0]} are {told}, not plausible in mm (0.25 to 100)"
-        raise ValueError(f"{path}: {what}. Check the columns. Metres, inches or micrometres? Convert to mm.")
-    return Kinematics(time_s, x)
 
 
 class RecordingWriter:
@@ -445,7 +376,7 @@ class RecordingWriter:
             write_table(self.folder / "frames.csv", ["frame", "time_s"], table, [0, 7])
         if self._kinematics:
             table = np.vstack(self._kinematics)
-            names = _kinematics_columns(self._header["skeleton"])
+            names = kinematics_columns(self._header["skeleton"])
             write_table(self.folder / "kinematics.csv", names, table, [7] + [6] * (len(names) - 1))
         if self._annotations is not None:
             path, names = self.folder / "annotations.json", self._header["skeleton"]

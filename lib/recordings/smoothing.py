@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lib.recordings.recording import Kinematics
+from lib.recordings.kinematics import Kinematics
 
 #: Degree of the local polynomials, and half-widths of their windows in samples; each sample gets the best of these windows.
 _DEGREE, _HALF_WIDTHS = 4, (3, 4, 5, 7, 10, 14, 20)

@@ -136,37 +136,6 @@ def test_kinematics_interpolate_on_the_robot_clock(written):
     np.testing.assert_allclose((x_mm - expected)[:, [0, 2]], 0, atol=1e-12)
 
 
-def test_dropped_samples_do_not_spread():
-    x = tool(4)
-    x[2, 1] = np.nan
-    kinematics = Kinematics(np.array([0.0, 1.0, 2.0, 3.0]), x)
-    at = kinematics.at([0.0, 0.5, 1.0, 1.5, 3.0, 3.1, -0.1])
-    np.testing.assert_allclose(at[1], (x[0] + x[1]) / 2)
-    np.testing.assert_array_equal(at[2], x[1])  # exactly on a sample beside the dropped one
-    assert np.isnan(at[3, 1]).all()
-    assert np.isfinite(at[3, [0, 2]]).all()
-    np.testing.assert_array_equal(at[4], x[3])
-    assert np.isnan(at[5:]).all()
-    np.testing.assert_array_equal(Kinematics(np.array([1.0]), x[:1]).at([1.0, 2.0])[0], x[0])
-
-
-def test_short_drops_of_a_fast_log_are_interpolated_and_long_ones_are_not():
-    time_s = np.arange(0, 2, 0.002)
-    x = time_s[:, None, None] * np.ones((3, 3))
-    dropped = x.copy()
-    dropped[[0, 100, 101, 400], 1] = np.nan
-    dropped[500:700] = np.nan
-    kinematics, at_s = Kinematics(time_s, dropped), np.array([0.001, 0.1999, 0.2, 0.2011, 0.801, 1.2, 1.5])
-    found = kinematics.at(at_s)
-    assert np.isnan(found[0, 1]).all() and np.isfinite(found[0, [0, 2]]).all() and np.isnan(found[5]).all()
-    np.testing.assert_allclose(found[[1, 2, 3, 4, 6]], at_s[[1, 2, 3, 4, 6], None, None] * np.ones((3, 3)), atol=1e-12)
-    slow_s = np.arange(0, 10, 0.05)
-    slow = Kinematics(slow_s, np.where(np.arange(200) % 4 == 2, np.nan, slow_s)[:, None, None] * np.ones((3, 3)))
-    assert np.isfinite(slow.at(np.arange(0, 9.9, 0.013))).all()  # every gap lasts 0.1 s
-    for one, t in zip(found, at_s, strict=True):  # a single time reads a part of the log
-        np.testing.assert_array_equal(kinematics.at([t])[0], one)
-
-
 def test_dropped_samples_survive_the_round_trip(tmp_path):
     x = tool(5)
     x[3] = np.nan
@@ -509,16 +478,6 @@ def test_bad_annotations_are_refused(folder, change, text):
     coco(folder, change)
     with pytest.raises(ValueError, match=text):
         Recording.open(folder)
-
-
-def test_a_frame_asks_for_a_part_of_a_long_log():
-    rng = np.random.default_rng(1)
-    time_s = np.cumsum(rng.choice([0.01, 0.02, 0.7], 3000, p=[0.6, 0.39, 0.01]))
-    x_mm = rng.normal(size=(3000, 3, 3))
-    x_mm[rng.random(3000) < 0.05] = np.nan
-    log, asked = Kinematics(time_s, x_mm), np.append(rng.uniform(-1, time_s[-1] + 1, 400), [*time_s[::500], np.nan])
-    np.testing.assert_array_equal(log.at(asked), np.concatenate([log.at([t]) for t in asked]))
-    assert 0.05 < np.isnan(log.at(asked)).mean() < 0.5
 
 
 def test_zeros_in_the_metadata_of_a_jpeg_are_no_damage(tmp_path):
