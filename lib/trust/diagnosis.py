@@ -25,7 +25,7 @@ from lib.trust.tool import jaw_opening, landmark_offset, tool_bends, tool_length
 from lib.trust.unsteady import FRAME_TESTS, OF_FRAMES, ROBOT_ERRS
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # most rows that are used; three frames leave nothing to check against
-_UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
+UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _SPIKED, _LEAST_SPIKE_MM = 5, 0.2  # width of a median filter in samples, and least distance of a spike from its output
 #: Gain in log likelihood of moved cameras (16 numbers), or of a jump (6), over a slipped tool (3) that rules the latter out.
 AS_GOOD = 6.0
@@ -270,7 +270,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
             return []
         what = f"{100 * max(wrong):.0f} % of the detections of {LANDMARKS[int(np.argmax(wrong))]}"
         text = f"{what} lie more than 5 % of the tool's length from where the cameras see it."
-    name, cure, images, each = "detector_unfit", _UNFIT, (0, 1), problem.used.sum(axis=0)
+    name, cure, images, each = "detector_unfit", UNFIT, (0, 1), problem.used.sum(axis=0)
     low, high = np.sort(of_eye := far.sum(axis=0) / np.maximum(each, 1))
     if low < _OTHER_EYE and high > _ONE_EYE and each.min() >= _UNFIT_FEWEST:
         side, other = (SIDES[k] for k in np.argsort(-of_eye))
@@ -278,7 +278,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         text = f"In the {side} images {100 * high:.0f} % of the landmarks lie more than 5 % of the tool's length from where "
         text += f"the cameras see them, in the {other} images {100 * low:.0f} %."
         cure = f"Are the {side} images of this recording, and each of the same instant as the {other} one? Else pair them "
-        cure += f"again. If they are: {_UNFIT}"
+        cure += f"again. If they are: {UNFIT}"
     return [Hypothesis(name, text, cure, 100 * share, 0.0, "%", share, float(gain), images)]
 
 
@@ -374,7 +374,7 @@ def diagnose(
     apart = log_elsewhere(data, kinematics, offset_s)
     if few:
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
-        unfit = Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
+        unfit = Hypothesis("detector_unfit", text, UNFIT, 100.0, 0.0, "%", 1.0, float(len(data)))
         return Diagnosis((*apart, unfit) if data.seen.all(axis=1).sum() >= 6 else (unfit,))
     if mixed := _mixed_units(data) or _same_tips(data):
         return Diagnosis(tuple(mixed))

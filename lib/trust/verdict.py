@@ -19,7 +19,7 @@ from lib.landmarks.shaft import ShaftEnd, shaft_end
 from lib.recordings import Doubt, Recording, Scene
 from lib.recordings.annotations import inside
 from lib.trust.clocks import PAIR_AGAIN
-from lib.trust.diagnosis import AS_GOOD, Diagnosis, diagnose, stated
+from lib.trust.diagnosis import AS_GOOD, UNFIT, Diagnosis, diagnose, stated
 from lib.trust.fitting import SIDES
 from lib.trust.footage import blurred, turned_images, with_footage
 from lib.trust.health import Health, feature_matches, health, spread
@@ -384,7 +384,8 @@ def assess(
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
         by_labels = ("detector_unfit", "one_eye_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
-        reasons = [replace(r, cure=cure) if r.name in by_labels else r for r in reasons]
+        mended = [r.cure.replace(UNFIT, cure) if UNFIT in r.cure else cure for r in reasons]
+        reasons = [replace(r, cure=m) if r.name in by_labels else r for r, m in zip(reasons, mended, strict=True)]
     reasons = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(reasons)), diagnosis, found, epipolar_px, shaft)
 

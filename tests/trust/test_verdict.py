@@ -208,6 +208,15 @@ def test_careless_labels_are_looked_at_again_and_no_detector_is_taught(decoded_o
     assert not any("Look again at the labels" in reason.cure for reason in blind.reasons)
 
 
+def test_labels_that_miss_in_one_eye_are_looked_at_after_the_images(decoded_once):
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    u = np.stack([recording.truth.u_left, recording.truth.u_right[::-1]])  # the right images run backwards
+    reasons = assess(recording, of_recording(recording, *u)).verdict.reasons
+    cure = next(reason.cure for reason in reasons if reason.name == "one_eye_unfit")
+    assert "Are the right images of this recording" in cure and "If they are: Look again at the labels" in cure
+    assert "adapt" not in cure
+
+
 @pytest.mark.parametrize("off", [0.0, 0.08])
 def test_a_base_that_the_detector_marks_along_the_shaft_is_told(decoded_once, monkeypatch, off):
     """Cameras with offsets explain it, and both images agree; only the images of the tool show it."""
