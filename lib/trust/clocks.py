@@ -282,14 +282,17 @@ def _filtered_log(case: Case) -> Iterator[Hypothesis]:
 
 
 def _backlash(case: Case) -> Iterator[Hypothesis]:
-    """Backlash: positions are displaced by a constant that changes sign with the direction of motion along each axis."""
-    direction = np.sign(np.where(case.problem.used.all(axis=1)[:, None], case.velocity(), 0.0))
-    fit = case.linear(lambda M: M[:, :, :3] * np.nan_to_num(direction)[:, None, None])
-    size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
-    along = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
-    text = f"The robot has backlash: when it reverses, its true position shifts by {along} um in x, y, z."
+    """Backlash: a displacement that changes sign with the direction of motion, along each axis or along the shaft."""
+    velocity = np.nan_to_num(np.where(case.problem.used.all(axis=1)[:, None], case.velocity(), 0.0))
+    shaft = case.problem.axes[:, :, 0]
+    along = (shaft * np.sign((shaft * velocity).sum(axis=1, keepdims=True)))[..., None]
     cure = "Measure positions on the tool's side of the gears, or approach each position from one side."
-    yield case.found("backlash", fit, 3, (1e3 * size, 1e3 * sd, "um"), text, cure)
+    for directions, where in ((np.sign(velocity)[:, None] * np.eye(3), "in x, y, z"), (along, "along the shaft")):
+        fit = case.linear(lambda M, d=directions: np.einsum("cij,njk->ncik", M[:, :, :3], d))
+        size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
+        shifts = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
+        text = f"The robot has backlash: when it reverses, its true position shifts by {shifts} um {where}."
+        yield case.found("backlash", fit, fit.theta.size, (1e3 * size, 1e3 * sd, "um"), text, cure)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:

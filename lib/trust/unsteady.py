@@ -22,6 +22,11 @@ ROBOT_ERRS = (
     "Check times, units, columns of kinematics.csv; the robot's accuracy, which may depend on its position; "
     "and how its poses become points: the tool's transform, and the convention of rotations (or are they inverse?)."
 )
+_WANDERS = (
+    "Does the eye roll, and with it the pivot of the shaft? Does the microscope sway, the shaft bend, or the robot drift? "
+    "Hold what moves, or calibrate shorter parts (--frames A:B)."
+)
+_COSINES = (2, 4, 8)  # numbers of cosines that are tried
 _COMMON = 0.8  # share of the gain by times of each frame, above which one clock that is off is the reason
 _MOST = 0.5  # least median size of the parameters over their RMS: gross errors only affect a part of the frames
 
@@ -84,6 +89,25 @@ def unsteady(case: Case) -> Iterator[Hypothesis]:
             yield case.found(name, found.fit, 1, (size, 0.0, unit), text, cure, raw=found.raw, images=views)
 
 
+def wanders(case: Case) -> Iterator[Hypothesis]:
+    """The robot's report deviates slowly, equally for all landmarks: the deviation is a sum of few cosines of the time."""
+    problem, time = case.problem, case.problem.time
+    if case.frames < _FEWEST_FRAMES or not np.isfinite(time).all() or np.ptp(time) == 0:
+        return
+    found = []
+    for count in (count for count in _COSINES if 3 * count <= case.frames / 2):
+        cosines = np.cos(np.pi * np.arange(1, count + 1) * (time - time.min())[:, None] / np.ptp(time))  # (n, count)
+        fit = case.linear(lambda M, c=cosines: np.einsum("cij,nk->ncijk", M[:, :, :3], c).reshape(len(problem), 2, 2, -1))
+        wandered_mm = cosines @ fit.theta.reshape(3, count).T
+        size = float(np.sqrt(((wandered_mm - wandered_mm.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        moved_px = float(np.sqrt((fit.moved_px[problem.used] ** 2).sum(axis=1).mean()))
+        if size > case.robot_mm and moved_px > _claimed_px(case):
+            text = f"Over seconds images and robot differ by {size:.2g} mm (RMS), equally for all landmarks."
+            found.append(case.found("robot_wanders", fit, 3 * count, (1e3 * size, 0.0, "um"), text, _WANDERS))
+    if found:
+        yield max(found, key=lambda one: one.gain)
+
+
 class _PerFrame(NamedTuple):
     """Parameters of the frames, and the fit with them."""
 
@@ -141,4 +165,4 @@ def _by_frame(case: Case, columns: Callable[[np.ndarray], np.ndarray], sd: float
 #: Causes with parameters for each frame, so many that they leave white residuals, whatever is wrong.
 OF_FRAMES = ("robot_noise", "time_stamps", "image_sways", "zoom_varies")
 #: Tests that only need the rows; some also use the tool's path over time if there is one.
-FRAME_TESTS = (rigid_tips, unsteady)
+FRAME_TESTS = (rigid_tips, unsteady, wanders)

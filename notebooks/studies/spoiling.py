@@ -611,7 +611,7 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("left image sways", "4 px, each frame"): (("image_sways",), _swaying(4.0, (0,))),
     ("right image sways", "8 px, slowly"): (("image_sways",), _swaying(8.0, (1,), 4.0)),
     ("microscope sways", "6 px, each frame"): (("robot_noise",), _swaying(6.0, (0, 1))),
-    ("microscope sways", "12 px, slowly"): (("robot_noise",), _swaying(12.0, (0, 1), 4.0)),
+    ("microscope sways", "12 px, slowly"): (("robot_wanders", "robot_noise"), _swaying(12.0, (0, 1), 4.0)),
     ("lenses breathe", "1 %"): (("zoom_varies",), _breathing(0.01, 1.7, (0, 1))),
     ("left lens breathes", "2 %"): (("zoom_varies",), _breathing(0.02, 0.9, (0,))),
     **{("frames stamped apart", f"{1e3 * s:.0f} ms"): (("time_stamps", "frame_order"), _jittering(s))

@@ -101,6 +101,35 @@ def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
         assert best.value == pytest.approx(value, abs=max(4 * best.sd, 0.1 * abs(value)))
 
 
+def with_log_off(usual, off_mm):
+    """The take with a log that lies `off_mm` (m, 3) beside the tool, and the rows that follow from it."""
+    log = Kinematics(usual.kinematics.time_s, usual.kinematics.x_mm + off_mm[:, None])
+    x_mm = log.at(usual.data.time_s + usual.offset_s)[np.arange(len(usual.data)), usual.data.landmark]
+    return replace(usual, kinematics=log, data=replace(usual.data, x_mm=x_mm))
+
+
+@pytest.mark.parametrize("size_mm", [0.1, 0.4])
+def test_a_robot_that_errs_slowly_is_told_from_one_that_errs_from_frame_to_frame(size_mm):
+    """The pivot of the shaft moves with the eye."""
+    usual = take(frames=60)
+    phase = 2 * np.pi * (usual.kinematics.time_s - usual.kinematics.time_s[0])[:, None] / [3.1, 2.3, 4.4]
+    off_mm = size_mm * np.sin(phase + [0.0, 1.0, 2.0])
+    best = found(with_log_off(usual, off_mm)).best
+    assert best.name == "robot_wanders" and 0.3 * size_mm < 1e-3 * best.value < 2 * size_mm  # cameras absorb a part
+    assert f"differ by {1e-3 * best.value:.2g} mm (RMS), equally for all landmarks" in best.text and "eye roll" in best.cure
+
+
+@pytest.mark.parametrize("size_mm", [0.08, 0.2])
+def test_backlash_along_the_shaft_is_named(size_mm):
+    usual = take(frames=60)
+    base, tips = usual.kinematics.x_mm[:, 0], usual.kinematics.x_mm[:, 1:].mean(axis=1)
+    shaft = (tips - base) / np.linalg.norm(tips - base, axis=1, keepdims=True)
+    forwards = np.sign((np.gradient(base, axis=0) * shaft).sum(axis=1, keepdims=True))
+    best = found(with_log_off(usual, -size_mm / 2 * forwards * shaft)).best
+    assert best.name == "backlash" and "um along the shaft" in best.text
+    assert best.value == pytest.approx(1e3 * size_mm, abs=4 * best.sd)
+
+
 @pytest.mark.parametrize(("seed", "frames"), [(2, 18), (8, 24)])
 def test_the_curvature_of_a_near_microscope_accuses_nobody_else(seed, frames):
     """Few frames and many wrong landmarks hide a working distance, which skews the pixels of affine cameras."""
