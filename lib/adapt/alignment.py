@@ -38,8 +38,8 @@ _FAULTS = dict.fromkeys((
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
     "rigid_tips", "jaw_opening", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift", "smoothed_log", "image_sways",
     "zoom_varies", "time_stamps", "backlash", "odd_pixels", "mixed_units", "same_images", "same_tips",
-    "interlaced", "frozen_orientation",
-), 0.15) | dict.fromkeys(("robot_drifts", "robot_wanders", "robot_noise"), 0.3)  # fmt: skip
+    "interlaced", "frozen_orientation", "robot_wanders",
+), 0.15) | {"robot_drifts": 0.3, "robot_noise": 0.3}  # fmt: skip
 #: Residuals below this share of the tool's length are harmless, whatever fault explains them.
 _HARMLESS = 0.01
 #: Largest correction of the clock in a joint step with cameras and offsets, which assumes straight motion.
