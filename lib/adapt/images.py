@@ -7,7 +7,7 @@ import numpy as np
 
 from lib import files
 from lib.adapt.judging import better, frame_means
-from lib.adapt.loop import RECIPE, STEPS, Adaptation, simulated_like, work_folder
+from lib.adapt.loop import RECIPE, STEPS, Adaptation, work_folder
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
@@ -16,6 +16,7 @@ from lib.recordings import read_image
 from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints
 from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage, shown_by_coco
+from lib.training.shards import simulated_like
 from lib.training.stages import finetune
 
 

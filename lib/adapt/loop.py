@@ -3,12 +3,11 @@
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lib import files, paths
@@ -36,14 +35,14 @@ from lib.provenance import Provenance, plain
 from lib.recordings import Recording, smoothed
 from lib.recordings.annotations import CLICK_SD_PX, read_coco
 from lib.training.samples import LabelledImage
-from lib.training.shards import generate, validation_images
+from lib.training.shards import simulated_like
 from lib.training.stages import finetune
 from lib.trust.footage import turned_images
 from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 39  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 40  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.
@@ -53,7 +52,6 @@ _UNSMOOTHED = (
 )
 #: Most stereo frames that are used, spread over the recording.
 _MOST_FRAMES = 96
-_SIMULATED_SHARDS = 3
 #: Relative change of the mean distance from the robot in the frames for stopping.  A round that gains less than this is the
 #: last, and one that loses more is not kept.  Those frames are few, so the frames for judging decide.
 _LEAST_GAIN = 0.03
@@ -366,8 +364,9 @@ class _Work:
 
     def near(self, name: str, detector: Detector, frames: np.ndarray, teacher: Teacher) -> Seen:
         """Detections near the robot's landmarks; if the jaws are angled, those of the base in windows along the shaft."""
-        u = teacher.labels(frames)[0]
+        u, _, shown = teacher.labels(frames)
         seen, axes = self.look(name, detector, frames, u), teacher.axes_px(frames)
+        seen = seen._replace(confidence=seen.confidence * (shown > 0))  # at the border something may look like a landmark
         if self.axis is None:
             self.axis = shaft_axis(self.recording, frames, u[:, :, 0], axes)
         if self.axis[0] > _ANGLED:
@@ -481,20 +480,3 @@ class _Work:
 def work_folder(folder: str | Path | None, name: str, key: list) -> Path:
     """The folder of an adaptation's intermediate results, a separate one for each `key`."""
     return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / files.digest(repr(key).encode())
-
-
-def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:
-    """Simulated frames in the colours of some images, which keep the networks from forgetting others; kept in the cache."""
-    folder = paths.CACHE / "adapt" / "simulated"
-    generate(folder, "held_out", _SIMULATED_SHARDS, progress=progress)
-    pixels = (cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3) for image in images)
-    like = [(lab.mean(axis=0), lab.std(axis=0)) for lab in pixels]
-    rng, found = np.random.default_rng([seed, 1]), []
-    for labelled in validation_images(folder):
-        lab = cv2.cvtColor(labelled.image, cv2.COLOR_RGB2LAB).astype(np.float32)
-        mean, sd = like[rng.integers(len(like))]
-        moved = (lab - lab.mean(axis=(0, 1))) * (sd / np.maximum(lab.std(axis=(0, 1)), 1.0)) + mean
-        part = np.float32(rng.uniform(0, 1))  # some keep their own colours
-        image = np.clip((1 - part) * lab + part * moved, 0, 255).astype(np.uint8)
-        found.append(labelled._replace(image=cv2.cvtColor(image, cv2.COLOR_LAB2RGB)))
-    return found

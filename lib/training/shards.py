@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from lib import paths
 from lib.files import whole
 from lib.geometry import cell_from_image
 from lib.landmarks import Detector
@@ -26,6 +27,7 @@ from lib.training.samples import LabelledImage
 
 #: Longest side of a stored whole scene.
 SCENE_PX = 512
+_LIKE_SHARDS = 3  # number of shards in the colours of some images
 #: Seeds of each kind of shard.
 _SEEDS = {"closeups": (5, 77), "scenes": (6,), "held_out": (7,)}
 #: Side of the crops that closeups are cut from.
@@ -199,3 +201,20 @@ def validation_images(folder: str | Path, kind: str = "held_out") -> Iterator[La
         jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):
             yield LabelledImage(f"{path.stem} {i}", cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB), u[i], visibility[i])
+
+
+def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:
+    """Simulated frames in the colours of some images, which keep the networks from forgetting others; kept in the cache."""
+    folder = paths.CACHE / "adapt" / "simulated"
+    generate(folder, "held_out", _LIKE_SHARDS, progress=progress)
+    pixels = (cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3) for image in images)
+    like = [(lab.mean(axis=0), lab.std(axis=0)) for lab in pixels]
+    rng, found = np.random.default_rng([seed, 1]), []
+    for labelled in validation_images(folder):
+        lab = cv2.cvtColor(labelled.image, cv2.COLOR_RGB2LAB).astype(np.float32)
+        mean, sd = like[rng.integers(len(like))]
+        moved = (lab - lab.mean(axis=(0, 1))) * (sd / np.maximum(lab.std(axis=(0, 1)), 1.0)) + mean
+        part = np.float32(rng.uniform(0, 1))  # some keep their own colours
+        image = np.clip((1 - part) * lab + part * moved, 0, 255).astype(np.uint8)
+        found.append(labelled._replace(image=cv2.cvtColor(image, cv2.COLOR_LAB2RGB)))
+    return found

@@ -618,6 +618,17 @@ def test_a_log_may_hold_its_samples_and_not_stand_still():
 # --- the loop
 
 
+def test_nothing_is_found_near_a_landmark_outside_the_image():
+    """A tool that is withdrawn: on the border of the image, something may look like its tip."""
+    rng, frames = np.random.default_rng(0), np.arange(4)
+    u, shown = rng.uniform(0, 100, (4, 2, 3, 2)), rng.integers(0, 3, (4, 2, 3))
+    seen = Seen(frames, u, np.tile(np.eye(2), (4, 2, 3, 1, 1)), np.full((4, 2, 3), 0.9))
+    told = SimpleNamespace(labels=lambda _: (u, None, shown), axes_px=lambda _: None)
+    work = SimpleNamespace(axis=np.array([1.0, 0.0, 0.0]), look=lambda *_: seen)
+    found = loop._Work.near(work, "guided", None, frames, told)
+    np.testing.assert_array_equal(found.confidence, np.where(shown > 0, 0.9, 0.0))
+
+
 @pytest.fixture(scope="module")
 def continued(world, recording, tmp_path_factory):
     """(adaptation of a half-wrong detector that was killed in its training and went on, detector, what it taught)."""
