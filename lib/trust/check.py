@@ -128,7 +128,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
 def _next(recording: Recording, a: Assessment, frames: range) -> str:
     """The next step, in words.  Wrong time stamps come first where there is no calibration or no specific cause."""
     best = a.diagnosis.best
-    vague = "detector_unfit", "one_eye_unfit", "robot_noise"
+    vague = "detector_unfit", "one_eye_unfit", "robot_noise", "robot_wanders"
     unspecific = a.calibration is None or (best is not None and best.name in vague)
     unspecific |= any(doubt.name in LOG_DOUBTS for doubt in recording.doubts)
     if unspecific and a.verdict.is_red and recording.mistimed:

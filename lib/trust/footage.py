@@ -17,7 +17,9 @@ from lib.trust.fitting import SIDES, Hypothesis
 from lib.trust.health import spread
 
 #: Causes that these defects look like.
-_OF_TIMES = ("clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "smoothed_log", "frozen_video")
+_OF_TIMES = (
+    "clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "robot_wanders", "smoothed_log", "frozen_video",
+)  # fmt: skip
 _LOOKED_AT, _AROUND = 8, 0.3  # images in which combs are looked for; margin around the tool, as a share of its extent
 _COMBED = 3.0  # least ratio of jagged rows to jagged columns; in images of one instant it is 0.9 to 1.8
 _STRETCHES, _STRETCH = 3, 13  # stretches of consecutive images that are compared, and their lengths

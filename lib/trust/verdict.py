@@ -77,7 +77,7 @@ _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 #: Least share of the images with a landmark, by robot and cameras, in which the detector finds it; and fewest such images.
 _LEAST_FOUND, _FEWEST_SHOWN = 0.5, 16
 LOG_DOUBTS = ("repeated_samples", "bursts")  # doubts about the times of the log, and the named faults that they explain
-_BY_LOG = ("clock", "time_stamps", "robot_noise", "smoothed_log", "odd_pixels")
+_BY_LOG = ("clock", "time_stamps", "robot_noise", "robot_wanders", "smoothed_log", "odd_pixels")
 #: Causes of which a refused calibration says less, or something else.
 _KNOWS_BETTER = (
     "mirrored_axis", "exchanged_eyes", "turned_image", "turned_images", "mirrored_images", "mixed_units", "same_images",

@@ -399,8 +399,9 @@ def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_d
 
 
 @pytest.mark.parametrize("doubted", ["repeated_samples", "bursts"])
-@pytest.mark.parametrize(("name", "cure"), [("time_stamps", "Keep the first rows."), ("camera_moved", "Do not round.")])
-def test_a_log_that_repeats_its_positions_or_comes_in_bursts_is_mended_before_the_times(name, cure, doubted):
+@pytest.mark.parametrize(("name", "mended"), [("time_stamps", True), ("robot_wanders", True), ("camera_moved", False)])
+def test_a_log_that_repeats_its_positions_or_comes_in_bursts_is_mended_before_the_times(name, mended, doubted):
+    cure = "Keep the first rows." if mended else "Do not round."
     found = Hypothesis(name, "It errs.", "Do not round.", 23.0, 1.0, "ms", explained=0.9, gain=100.0)
     doubt = Doubt(doubted, "It repeats.", "Keep the first rows.")
     verdict = judge(None, None, diagnosis=Diagnosis((found,)), error=DataError("no."), doubts=[doubt])
