@@ -290,9 +290,10 @@ def _backlash(case: Case) -> Iterator[Hypothesis]:
     for directions, where in ((np.sign(velocity)[:, None] * np.eye(3), "in x, y, z"), (along, "along the shaft")):
         fit = case.linear(lambda M, d=directions: np.einsum("cij,njk->ncik", M[:, :, :3], d))
         size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
-        shifts = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
-        text = f"The robot has backlash: when it reverses, its true position shifts by {shifts} um {where}."
-        yield case.found("backlash", fit, fit.theta.size, (1e3 * size, 1e3 * sd, "um"), text, cure)
+        if size - 2.0 * sd > case.robot_mm:
+            shifts = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
+            text = f"The robot has backlash: when it reverses, its true position shifts by {shifts} um {where}."
+            yield case.found("backlash", fit, fit.theta.size, (1e3 * size, 1e3 * sd, "um"), text, cure)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:
