@@ -9,7 +9,7 @@ import numpy as np
 from lib.calibration.timing import shift_misfits
 from lib.correspondences import Correspondences
 from lib.recordings import Kinematics
-from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, by_steps
 
 #: Clock rates that are tried: seconds of the robot's clock per second of the video's stated time; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
@@ -67,8 +67,8 @@ def _refined(
         problem = case.problem.moved_to(np.where(np.isfinite(velocity), case.moved(later), np.nan), views)
         if problem.used.all(axis=1).sum() < 6:
             return None
-        v = velocity[:, None] * np.isin((0, 1), views)[:, None]
-        fit = problem.fit(lambda M, v=v: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, columns), start=start)
+        steps = velocity[:, None, :, None] * np.isin((0, 1), views)[:, None, None] * columns.T[:, None, None]
+        fit = problem.fit(by_steps(steps), start=start)
         start, sd = fit.start, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
@@ -258,7 +258,7 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
     """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
     known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
-    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
+    fit = case.linear(by_steps(acceleration[..., None]), known)
     value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
     if value > 3 * sd:
         text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
@@ -273,7 +273,7 @@ def _filtered_log(case: Case) -> Iterator[Hypothesis]:
     """
     velocity = case.velocity()
     known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
-    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], known)
+    fit = case.linear(by_steps(velocity[..., None]), known)
     value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
     late = max((case.fits[name].total for name in ("clock", "camera_clock") if name in case.fits), default=-np.inf)
     if value > 3 * sd and fit.total > late + _SURELY_FILTERED:
@@ -284,7 +284,7 @@ def _filtered_log(case: Case) -> Iterator[Hypothesis]:
 def _backlash(case: Case) -> Iterator[Hypothesis]:
     """Backlash: positions are displaced by a constant that changes sign with the direction of motion along each axis."""
     direction = np.sign(np.where(case.problem.used.all(axis=1)[:, None], case.velocity(), 0.0))
-    fit = case.linear(lambda M: M[:, :, :3] * np.nan_to_num(direction)[:, None, None])
+    fit = case.linear(by_steps(np.nan_to_num(direction)[..., None] * np.eye(3)))
     size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
     along = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
     text = f"The robot has backlash: when it reverses, its true position shifts by {along} um in x, y, z."
@@ -300,8 +300,7 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
     velocity = case.velocity()
     known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
     for views in ((0, 1), (0,), (1,)):
-        moved = velocity[:, None] * row * np.isin((0, 1), views)[:, None]
-        fit = case.linear(lambda M, v=moved: np.einsum("cij,ncj->nci", M[:, :, :3], v)[..., None], known)
+        fit = case.linear(by_steps((velocity[:, None] * row * np.isin((0, 1), views)[:, None])[..., None]), known)
         value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:

@@ -18,7 +18,7 @@ from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.parallel import single_threaded_blas
 from lib.recordings import Kinematics, Recording
 from lib.trust.clocks import TIME_TESTS, log_elsewhere
-from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, by_steps, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
 from lib.trust.tool import jaw_opening, landmark_offset, tool_bends, tool_length
@@ -160,7 +160,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
     yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
     slipped = problem.axes * late[..., None]
-    fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
+    fit = case.linear(by_steps(slipped))
     size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
     text = f"The tool slipped {when}, by {size:.0f} um ({along} um in the tool's axes)."
     cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "

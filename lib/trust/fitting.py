@@ -187,8 +187,7 @@ class Problem:
     def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """`columns` of `fit` for a turn and a shift of all landmarks together (6 numbers), scaled by `share` (n,) of rows."""
         turns, shifts = np.cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
-        moves = share[:, None, None, None] * np.concatenate([turns, shifts], axis=2)
-        return lambda M: np.einsum("cij,nckj->ncik", M[:, :, :3], moves)
+        return by_steps(share[:, None, None, None] * np.concatenate([turns, shifts], axis=2).mT)
 
     def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
         """The frame at which a change of cameras explains the rows best, and the fit with that change.
@@ -296,6 +295,12 @@ class Problem:
         block = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
         sums = np.array([np.bincount(block, one) for one in z.sum(axis=1).T])  # (2, blocks)
         return float(max(1.0, ((sums**2).sum(axis=1) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
+
+
+def by_steps(steps: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """`columns` of `Problem.fit` for motions of the landmarks along steps (n, 3, k) mm, or (n, 2, 3, k) in each image."""
+    steps = steps if steps.ndim == 4 else steps[:, None]
+    return lambda M: np.einsum("cij,ncjk->ncik", M[:, :, :3], steps)
 
 
 def _by_nearness(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
