@@ -1,7 +1,6 @@
 """Hypotheses about time: clocks, frame rates, the order of the frames, and the shutter."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -257,9 +256,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
     """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
-    fit = case.linear(by_steps(acceleration[..., None]), known)
-    value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
+    fit, known, value, sd = case.multiple_of(acceleration[:, None] / -24.0)
     if value > 3 * sd:
         text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
         size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
@@ -267,14 +264,8 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
 
 
 def _filtered_log(case: Case) -> Iterator[Hypothesis]:
-    """A log that a filter of first order delays: the true position is x + tau dx/dt, if tau is its time constant.
-
-    The filter must explain the rows better than a late clock does.
-    """
-    velocity = case.velocity()
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
-    fit = case.linear(by_steps(velocity[..., None]), known)
-    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    """A log that a filter of first order delays: the true position is x + tau dx/dt, if tau is its time constant."""
+    fit, known, value, sd = case.multiple_of(case.velocity()[:, None])
     late = max((case.fits[name].total for name in ("clock", "camera_clock") if name in case.fits), default=-np.inf)
     if value > 3 * sd and fit.total > late + _SURELY_FILTERED:
         text = f"The robot's log lags behind its motion, as by a filter of a time constant of {1e3 * value:.0f} ms."
@@ -297,11 +288,8 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
     if case.size is None:
         return
     row = np.clip(case.problem.y[:, :, 1:] / (case.size[1] - 1) - 0.5, -0.6, 0.6)
-    velocity = case.velocity()
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
     for views in ((0, 1), (0,), (1,)):
-        fit = case.linear(by_steps((velocity[:, None] * row * np.isin((0, 1), views)[:, None])[..., None]), known)
-        value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+        fit, known, value, sd = case.multiple_of(case.velocity()[:, None] * row * np.isin((0, 1), views)[:, None])
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")

@@ -408,9 +408,15 @@ class Case:
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 
-    def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None) -> Robust:
+    def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray]) -> Robust:
         """The fit with additional `columns`, as `Problem.fit` takes them."""
-        return (on or self.problem).fit(columns, start=self.null.start)
+        return self.problem.fit(columns, start=self.null.start)
+
+    def multiple_of(self, step: np.ndarray) -> tuple[Robust, Problem, float, float]:
+        """The fit with a multiple of steps (n, 1 or 2, 3) mm, its rows (whose step is known), the multiple, and its sd."""
+        known = replace(self.problem, seen=self.problem.used & np.isfinite(step).all(axis=2))
+        fit = known.fit(by_steps(step[..., None]), start=self.null.start)
+        return fit, known, float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
