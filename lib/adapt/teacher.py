@@ -23,7 +23,7 @@ from lib.landmarks.recorded import Seen
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
-from lib.trust.fitting import SIDES, Problem, Robust
+from lib.trust.fitting import SIDES, Problem, by_steps
 
 #: Least mean confidence of the inliers of a tip.  If the detector expects most of those that agree with each other to be
 #: wrong, they agree on another point, such as the elbow of a jaw.
@@ -71,24 +71,19 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
             return frames, ""
         log_s, own = rows.time_s + recording.offset_s, (np.arange(len(rows)), rows.landmark)
         early, late = (recording.kinematics.at(log_s + step_s)[own] for step_s in (-_STEP_S, _STEP_S))
-        velocity = np.nan_to_num(late - early) / (2 * _STEP_S)
-        fit = _with_clock(problem, velocity)
+        velocity = np.nan_to_num(late - early)[..., None] / (2 * _STEP_S)  # fits the clock along with the cameras
+        fit = problem.fit(by_steps(velocity))
         recording = replace(recording, offset_s=recording.offset_s + float(np.clip(fit.theta[0], -0.1, 0.1)))
     first = np.unique(rows.frame)[problem.other_cameras(fit)[0]]
     parts = frames[frames < first], frames[frames >= first]
     each = [Problem.of(rows.of_frames(part), recording.image_size_px) for part in parts]
-    apart = [_with_clock(one, velocity[np.isin(rows.frame, part)]).total for one, part in zip(each, parts, strict=True)]
+    apart = [one.fit(by_steps(velocity[np.isin(rows.frame, part)])).total for one, part in zip(each, parts, strict=True)]
     # Separate cameras have 17 parameters more with the clock, and 12 allows for the choice of the cut.  Few frames may fit by
     # chance.
     if min(map(len, parts)) < 0.15 * len(frames) or sum(apart) - fit.total < 17 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
     return kept, f"The cameras moved or the tool slipped at frame {first}: only frames {kept[0]} to {kept[-1]} are used."
-
-
-def _with_clock(problem: Problem, velocity: np.ndarray) -> Robust:
-    """Cameras along with the clock, given the velocities (n, 3) mm/s of the rows."""
-    return problem.fit(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None])
 
 
 @dataclass(frozen=True, eq=False)

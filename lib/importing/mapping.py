@@ -184,12 +184,9 @@ def read_mapping(path: str | Path) -> Mapping:
         text = 'a number of seconds is needed, or the word "estimate"' if last == "float" else text
         if first["type"] == "extra_forbidden":
             schema = Mapping.model_json_schema()
-            parts = [("the top", schema), *((f"[{name.lower()}]", part) for name, part in schema["$defs"].items())]
-            homes: dict[str, list[str]] = {}
-            for home, part in parts:
-                for name in part.get("properties", {}):
-                    homes.setdefault(name, []).append(home)
-            near = get_close_matches(str(last), sorted(homes), 1)
-            text = f"no such key here; the nearest one is {near[0]}" if near else "no such key here"
-            text = f"no such key here; it belongs to {' or '.join(homes[str(last)])}" if last in homes else text
+            parts = {"the top": schema} | {f"[{name.lower()}]": part for name, part in schema["$defs"].items()}
+            homes = [home for home, part in parts.items() if last in part["properties"]]
+            near = get_close_matches(str(last), sorted({name for part in parts.values() for name in part["properties"]}), 1)
+            text = f"; it belongs to {' or '.join(homes)}" if homes else f"; the nearest one is {near[0]}" if near else ""
+            text = f"no such key here{text}"
         raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None

@@ -1,7 +1,6 @@
 """Hypotheses about time: clocks, frame rates, the order of the frames, and the shutter."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 from lib.calibration.timing import shift_misfits
 from lib.correspondences import Correspondences
 from lib.recordings import Kinematics
-from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, by_steps
 
 #: Clock rates that are tried: seconds of the robot's clock per second of the video's stated time; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
@@ -67,8 +66,8 @@ def _refined(
         problem = case.problem.moved_to(np.where(np.isfinite(velocity), case.moved(later), np.nan), views)
         if problem.used.all(axis=1).sum() < 6:
             return None
-        v = velocity[:, None] * np.isin((0, 1), views)[:, None]
-        fit = problem.fit(lambda M, v=v: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, columns), start=start)
+        steps = velocity[:, None, :, None] * np.isin((0, 1), views)[:, None, None] * columns.T[:, None, None]
+        fit = problem.fit(by_steps(steps), start=start)
         start, sd = fit.start, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
@@ -257,9 +256,7 @@ def _sorted_as_text(case: Case) -> Iterator[Hypothesis]:
 def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
     """A log that a moving average has smoothed, which displaces each position by acceleration * window^2 / 24."""
     acceleration = case.paths.at(case.problem.landmark, case.at_s, 2)
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(acceleration).all(axis=1)[:, None])
-    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], acceleration)[..., None], known)
-    value, sd = -24.0 * float(fit.theta[0]), 24.0 * float(np.sqrt(fit.covariance[0, 0]))
+    fit, known, value, sd = case.multiple_of(acceleration[:, None] / -24.0)
     if value > 3 * sd:
         text = f"The robot's log is smoothed over about {1e3 * np.sqrt(value):.0f} ms: this cuts corners and shrinks motion."
         size = 1e3 * np.sqrt(value), 500.0 * sd / np.sqrt(value), "ms"
@@ -267,14 +264,8 @@ def _smoothed_log(case: Case) -> Iterator[Hypothesis]:
 
 
 def _filtered_log(case: Case) -> Iterator[Hypothesis]:
-    """A log that a filter of first order delays: the true position is x + tau dx/dt, if tau is its time constant.
-
-    The filter must explain the rows better than a late clock does.
-    """
-    velocity = case.velocity()
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
-    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], known)
-    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    """A log that a filter of first order delays: the true position is x + tau dx/dt, if tau is its time constant."""
+    fit, known, value, sd = case.multiple_of(case.velocity()[:, None])
     late = max((case.fits[name].total for name in ("clock", "camera_clock") if name in case.fits), default=-np.inf)
     if value > 3 * sd and fit.total > late + _SURELY_FILTERED:
         text = f"The robot's log lags behind its motion, as by a filter of a time constant of {1e3 * value:.0f} ms."
@@ -288,7 +279,7 @@ def _backlash(case: Case) -> Iterator[Hypothesis]:
     along = (shaft * np.sign((shaft * velocity).sum(axis=1, keepdims=True)))[..., None]
     cure = "Measure positions on the tool's side of the gears, or approach each position from one side."
     for directions, where in ((np.sign(velocity)[:, None] * np.eye(3), "in x, y, z"), (along, "along the shaft")):
-        fit = case.linear(lambda M, d=directions: np.einsum("cij,njk->ncik", M[:, :, :3], d))
+        fit = case.linear(by_steps(directions))
         size, sd = 2.0 * np.abs(fit.theta).max(), 2.0 * float(np.sqrt(np.diag(fit.covariance).max()))
         if size - 2.0 * sd > case.robot_mm:
             shifts = ", ".join(f"{2e3 * v:.0f}" for v in fit.theta)
@@ -301,12 +292,8 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
     if case.size is None:
         return
     row = np.clip(case.problem.y[:, :, 1:] / (case.size[1] - 1) - 0.5, -0.6, 0.6)
-    velocity = case.velocity()
-    known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
     for views in ((0, 1), (0,), (1,)):
-        moved = velocity[:, None] * row * np.isin((0, 1), views)[:, None]
-        fit = case.linear(lambda M, v=moved: np.einsum("cij,ncj->nci", M[:, :, :3], v)[..., None], known)
-        value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+        fit, known, value, sd = case.multiple_of(case.velocity()[:, None] * row * np.isin((0, 1), views)[:, None])
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")

@@ -18,7 +18,7 @@ from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.parallel import single_threaded_blas
 from lib.recordings import Kinematics, Recording
 from lib.trust.clocks import TIME_TESTS, log_elsewhere
-from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, compared
+from lib.trust.fitting import FITS, HOPELESS, SIDES, Case, Hypothesis, Problem, Robust, by_steps, compared
 from lib.trust.health import affine_epipolar
 from lib.trust.optics import axes_and_eyes, finite_distance, lens, stands_exchanged
 from lib.trust.tool import jaw_opening, landmark_offset, tool_bends, tool_length
@@ -160,7 +160,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     fit, size = exchanged.fit(start=both.start), (100 * late.mean(), 0.0, "%")
     yield case.found("exchanged_eyes", fit, 3, size, text, cure, raw=fit.total - case.null.total)
     slipped = problem.axes * late[..., None]
-    fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
+    fit = case.linear(by_steps(slipped))
     size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
     text = f"The tool slipped {when}, by {size:.0f} um ({along} um in the tool's axes)."
     cure = f"Fix the tool in its holder, or calibrate the frames before and after separately ({parts}). "
@@ -201,26 +201,22 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise would not repeat a number
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
-    frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
-    if frozen.mean() >= 0.02:
-        fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
-        if not frozen.all():  # a tool at rest seems to move as far as the noise
-            frozen &= step_y > 8 * fit.shapes[0].scale
-    if frozen.mean() >= 0.02:
-        text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
-        cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
-        yield certain("frozen_kinematics", fit, frozen, text, cure)
+    still = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
+    text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
+    cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
+    parts = [(problem.landmark >= 0, still, step_y, 0.0, text, cure)]
     for k, name in enumerate(LANDMARKS):
         still, moved_px = (sizes[1][:, k] < 1e-9) & (step_x > 1e-6), np.fmax(*(size[:, k] for size in sizes[2:]))
-        if still.mean() < 0.02:
-            continue
-        apart = np.isin(problem.frame, np.flatnonzero(still) + 1) & (problem.landmark == k)
-        fit = problem.fit(start=case.null.start, apart=apart)
-        wrong = still & (moved_px > 8 * fit.shapes[0].scale)
-        if wrong.mean() >= 0.02 and wrong.sum() > 0.5 * still.sum():  # else it rests, and some of its detections err
-            text = f"the robot's position of {name} alone stands still while it moves in the images"
-            cure = f"Log {name} at every sample; where its columns of kinematics.csv repeat an old position leave them blank."
-            yield certain("frozen_kinematics", fit, wrong, text, cure)
+        text = f"the robot's position of {name} alone stands still while it moves in the images"
+        cure = f"Log {name} at every sample; where its columns of kinematics.csv repeat an old position leave them blank."
+        parts.append((problem.landmark == k, still, moved_px, 0.5, text, cure))  # in most, else it rests and detections err
+    for rows, still, moved_px, least, text, cure in parts:
+        if still.mean() >= 0.02:
+            fit = problem.fit(start=case.null.start, apart=rows & np.isin(problem.frame, np.flatnonzero(still) + 1))
+            always = still.all() and rows.all()  # else a tool at rest seems to move as far as the noise
+            wrong = still & (always | (moved_px > 8 * fit.shapes[0].scale))
+            if wrong.mean() >= 0.02 and wrong.sum() > least * still.sum():
+                yield certain("frozen_kinematics", fit, wrong, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
     far = [step > 8 * noise for step in steps]  # if one image repeats, the other shows whether the tool moved

@@ -187,8 +187,7 @@ class Problem:
     def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """`columns` of `fit` for a turn and a shift of all landmarks together (6 numbers), scaled by `share` (n,) of rows."""
         turns, shifts = np.cross(np.eye(3), self.x[:, :, None]), np.broadcast_to(np.eye(3), (len(self), 2, 3, 3))
-        moves = share[:, None, None, None] * np.concatenate([turns, shifts], axis=2)
-        return lambda M: np.einsum("cij,nckj->ncik", M[:, :, :3], moves)
+        return by_steps(share[:, None, None, None] * np.concatenate([turns, shifts], axis=2).mT)
 
     def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
         """The frame at which a change of cameras explains the rows best, and the fit with that change.
@@ -298,6 +297,12 @@ class Problem:
         return float(max(1.0, ((sums**2).sum(axis=1) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
 
 
+def by_steps(steps: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """`columns` of `Problem.fit` for motions of the landmarks along steps (n, 3, k) mm, or (n, 2, 3, k) in each image."""
+    steps = steps if steps.ndim == 4 else steps[:, None]
+    return lambda M: np.einsum("cij,ncjk->ncik", M[:, :, :3], steps)
+
+
 def _by_nearness(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
     """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels, given `from_centre`, of positions x (..., n, 2, 3)."""
     normal = np.cross(M[:, 0, :3], M[:, 1, :3])
@@ -403,9 +408,15 @@ class Case:
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 
-    def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None) -> Robust:
+    def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray]) -> Robust:
         """The fit with additional `columns`, as `Problem.fit` takes them."""
-        return (on or self.problem).fit(columns, start=self.null.start)
+        return self.problem.fit(columns, start=self.null.start)
+
+    def multiple_of(self, step: np.ndarray) -> tuple[Robust, Problem, float, float]:
+        """The fit with a multiple of steps (n, 1 or 2, 3) mm, its rows (whose step is known), the multiple, and its sd."""
+        known = replace(self.problem, seen=self.problem.used & np.isfinite(step).all(axis=2))
+        fit = known.fit(by_steps(step[..., None]), start=self.null.start)
+        return fit, known, float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,

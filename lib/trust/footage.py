@@ -57,7 +57,6 @@ def with_footage(diagnosis: Diagnosis, recording: Recording, data: Correspondenc
     found = _frozen_orientation(best, recording, data)
     if best.name in _OF_TIMES:
         found = found or _interlaced(best, recording, data) or _repeated(best, recording, data) or _rounded(best, recording)
-        found = found or _rounded_log(best, recording)
     return Diagnosis((found, *(h for h in diagnosis.hypotheses if h.name != best.name))) if found else diagnosis
 
 
@@ -197,21 +196,20 @@ def _repeated(best: Hypothesis, recording: Recording, data: Correspondences) -> 
 
 
 def _rounded(best: Hypothesis, recording: Recording) -> Hypothesis | None:
-    """Uneven times that are multiples of a coarse unit, and errors of the size of its rounding."""
-    time_s = recording.frames.time_s
-    unit_s = next((unit_s for unit_s in _UNITS_S if np.abs(time_s - unit_s * np.rint(time_s / unit_s)).max() < 1e-6), 0.0)
+    """Uneven times, or positions, that are multiples of a coarse unit, and errors of the size of its rounding."""
+    x_mm, time_s, error = recording.kinematics.x_mm, recording.frames.time_s, 1e-3 * best.value
+    unit_s, unit_mm = _unit(time_s, _UNITS_S), _unit(x_mm[np.isfinite(x_mm)], _UNITS_MM)
     uneven = len(np.unique(np.rint(np.diff(time_s) / (unit_s or 1.0)))) > 1
-    if best.name != "time_stamps" or not uneven or not 0.1 * unit_s < 1e-3 * best.value < 0.5 * unit_s:
-        return None
-    text = f"The frames' times are rounded to {unit_s:g} s, and err by up to {500 * unit_s:g} ms."
-    return replace(best, text=text, cure="Write the frames' times to frames.csv as they were measured, to the millisecond.")
+    if best.name == "time_stamps" and uneven and 0.1 * unit_s < error < 0.5 * unit_s:
+        text = f"The frames' times are rounded to {unit_s:g} s, and err by up to {500 * unit_s:g} ms."
+        cure = "Write the frames' times to frames.csv as they were measured, to the millisecond."
+        return replace(best, text=text, cure=cure)
+    if best.name == "robot_noise" and 0.2 * unit_mm < error < unit_mm:
+        text = f"The robot's positions are rounded to {unit_mm:g} mm, and err by up to {500 * unit_mm:g} um along each axis."
+        return replace(best, text=text, cure="Log the robot's positions with all digits, to the micrometre.")
+    return None
 
 
-def _rounded_log(best: Hypothesis, recording: Recording) -> Hypothesis | None:
-    """Positions that are multiples of a coarse unit, and errors of the size of its rounding."""
-    x = recording.kinematics.x_mm[np.isfinite(recording.kinematics.x_mm)]
-    unit_mm = next((unit_mm for unit_mm in _UNITS_MM if np.abs(x - unit_mm * np.rint(x / unit_mm)).max() < 1e-6), 0.0)
-    if best.name != "robot_noise" or not 0.2 * unit_mm < 1e-3 * best.value < unit_mm:
-        return None
-    text = f"The robot's positions are rounded to {unit_mm:g} mm, and err by up to {500 * unit_mm:g} um along each axis."
-    return replace(best, text=text, cure="Log the robot's positions with all digits, to the micrometre.")
+def _unit(values: np.ndarray, units: tuple[float, ...]) -> float:
+    """The first of some units of which all values are multiples; 0 if there is none."""
+    return next((unit for unit in units if np.abs(values - unit * np.rint(values / unit)).max() < 1e-6), 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lib.calibration.timing import shift_misfits
 from lib.correspondences import LANDMARKS
-from lib.trust.fitting import Case, Hypothesis
+from lib.trust.fitting import Case, Hypothesis, by_steps
 from lib.trust.unsteady import is_constant
 
 _LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, and `calibrate` corrects such offsets
@@ -55,7 +55,7 @@ def tool_length(case: Case) -> Iterator[Hypothesis]:
         misfit = shift_misfits(problem.x[:, 0] + _LENGTHS_MM[:, None, None] * along[:, 0], y)
         start_mm = _LENGTHS_MM[misfit.sum(axis=1).argmin()]
         moved = replace(problem, x=problem.x + start_mm * along)
-        fit = moved.fit(lambda M, axes=axes: np.einsum("cij,njk->ncik", M[:, :, :3], axes))
+        fit = moved.fit(by_steps(axes))
         fits.append((fit.total, fit, fit.theta + [start_mm, 0.0, 0.0]))
     _, fit, offset_mm = max(fits, key=lambda one: one[0])
     size_mm, sd_mm = float(np.linalg.norm(offset_mm)), float(np.sqrt(np.trace(fit.covariance)))
@@ -71,7 +71,7 @@ def tool_bends(case: Case) -> Iterator[Hypothesis]:
     tips = case.problem.landmark > 0
     if 0 < tips.mean() < 1 and case.problem.landmark.max() <= 2:
         x = case.problem.x * tips[:, None, None]
-        fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
+        fit = case.linear(by_steps(np.kron(np.eye(3), x[:, :, None])))
         size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
         if size < _BENDS * case.problem.claimed_px(~tips):
             return  # the detector's error at the base is as large
@@ -93,7 +93,7 @@ def jaw_opening(case: Case) -> Iterator[Hypothesis]:
         return
     share = np.array([0.0, -0.5, 0.5])[case.problem.landmark]
     half = across[case.problem.frame] * share[:, None]
-    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None])
+    fit = case.linear(by_steps(half[..., None]))
     factor, sd = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
     # Where the opening changes little, factor and offsets may cancel; then the factor without offsets is near 1.
     y = case.problem.y
@@ -105,7 +105,7 @@ def jaw_opening(case: Case) -> Iterator[Hypothesis]:
         cure = "Does the robot's log state the opening of one jaw or of both? Check that, and the length of the jaws."
         yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
     halves = np.stack([half, half / np.maximum(each, 1e-9)[case.problem.frame, None]], axis=2)
-    fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], halves))
+    fit = case.linear(by_steps(halves))
     slope, sd, shut = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0])), float(fit.theta[1])
     if slope + 3.0 * sd < 0.0 < shut + slope * np.median(width):  # the median is below 0 if the tips are exchanged
         text = f"The jaw's signal runs the other way: tips that the robot reports {-shut / slope:.2f} mm apart are shut."

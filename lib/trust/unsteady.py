@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lib.trust.clocks import stamps_err
-from lib.trust.fitting import SIDES, Case, Hypothesis, Robust
+from lib.trust.fitting import SIDES, Case, Hypothesis, Robust, by_steps
 
 _FEWEST_FRAMES = 8
 _ROUNDS, _STEPS = 8, 10  # of the alternation between cameras and parameters; of the parameters' sd with given cameras
@@ -42,7 +42,7 @@ def rigid_tips(case: Case) -> Iterator[Hypothesis]:
     if len(width) < 6 or not is_constant(width):
         return
     half = problem.axes[:, :, 1] * np.array([0.0, -1.0, 1.0])[np.minimum(problem.landmark, 2), None]
-    found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None], 0.2)
+    found = _by_frame(case, by_steps(half[..., None]), 0.2)
     size = 2.0 * float(found.theta.std())
     text = f"The robot always reports tips {width.mean():.2f} mm apart; in the images this varies by {size:.2f} mm."
     cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
@@ -68,7 +68,7 @@ def unsteady(case: Case) -> Iterator[Hypothesis]:
         yield case.found("robot_noise", found.fit, 1, (1e3 * size, 0.0, "um"), text, cure, raw=found.raw)
     if moves and case.paths:
         velocity = np.nan_to_num(case.velocity())
-        found = _by_frame(case, lambda M: np.einsum("cij,nj->nci", M[:, :, :3], velocity)[..., None], 0.02)
+        found = _by_frame(case, by_steps(velocity[..., None]), 0.02)
         late = case.fits.get("clock", case.null)
         if _is_distinct(case, found) and late.total - case.null.total < _COMMON * found.raw:
             weight = np.bincount(problem.frame, (velocity**2).sum(axis=1), case.frames)  # a robot at rest shows no times
@@ -102,14 +102,11 @@ def wanders(case: Case) -> Iterator[Hypothesis]:
         return
     velocity, found = np.nan_to_num(case.velocity())[:, :, None] if case.paths else np.zeros((len(time), 3, 0)), []
 
-    def moved(M: np.ndarray, along: np.ndarray) -> np.ndarray:
-        return np.einsum("cij,njk->ncik", M[:, :, :3], along)
-
-    late = case.linear(lambda M: moved(M, velocity))
+    late = case.linear(by_steps(velocity))
     for count in (count for count in _COSINES if 3 * count <= case.frames / 2):
         cosines = np.cos(np.pi * np.arange(1, count + 1) * (time - time.min())[:, None] / np.ptp(time))  # (n, count)
         along = (np.eye(3)[:, :, None] * cosines[:, None, None]).reshape(len(time), 3, -1)
-        fit = case.linear(lambda M, a=along: moved(M, np.concatenate([velocity, a], axis=2)))
+        fit = case.linear(by_steps(np.concatenate([velocity, along], axis=2)))
         wandered_mm = along @ fit.theta[velocity.shape[2] :]
         size = float(np.sqrt(((wandered_mm - wandered_mm.mean(axis=0)) ** 2).sum(axis=1).mean()))
         moved_px = np.einsum("cij,nj->nci", fit.M[:, :, :3], wandered_mm - wandered_mm.mean(axis=0))[problem.used]
