@@ -109,12 +109,6 @@ class Landmarks:
         """(n,) bool: images whose landmarks have a low mean confidence."""
         return self.confidence.mean(1) < _UNSURE
 
-    def surest(self, other: Self) -> Self:
-        """Choose for each image these landmarks or the `other` ones, whichever have the higher mean confidence."""
-        result, better = Landmarks.join([self]), other.confidence.mean(1) > self.confidence.mean(1)
-        result.put(better, other[better])
-        return result
-
     def away(self, u: np.ndarray) -> np.ndarray:
         """(n, 3) bool: landmarks farther than `NEAR` from the expected positions u (n, 3, 2) px."""
         return np.linalg.norm(self.u - u, axis=2) > NEAR * tool_length_px(u)[:, None]
@@ -261,7 +255,8 @@ class Detector:
             if len(unsure := np.flatnonzero(result.doubtful)):
                 other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
                 other = other if k < len(looks) else replace(other, confidence=_SWEEP_FACTOR * other.confidence)
-                result.put(unsure, result[unsure].surest(other))
+                surer = other.confidence.mean(1) > result.confidence[unsure].mean(1)
+                result.put(unsure[surer], other[surer])
         return result
 
     def _once(self, images: np.ndarray, sweep: bool = False) -> Landmarks:
