@@ -336,7 +336,7 @@ class Detector:
             best = np.argsort(-likelihood(u, once))[:_SECOND_LOOKS]
             u, twice = self._looked(images[i], u[best], "again")
             chosen = likelihood(u, twice).argmax()
-            result.put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
+            result.u[i], result.covariance[i] = tools[best[chosen]], np.nan
             height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
