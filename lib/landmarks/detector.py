@@ -35,8 +35,10 @@ from lib.landmarks.search import PEAKS, best_tools, likelihood, near_only, sever
 from lib.parallel import single_threaded_torch
 
 FORMAT = "microstereo.detector"
-#: The stages that have their own networks, in the order of their use.
-_STAGES = ("frame", "tool", "closeup")
+#: The stages that use closeups: the first closeup, a second one if the first moved the landmark far, and tracking.
+CLOSE = ("closeup", "closer", "tracking")
+#: All stages in the order of their use, and the one whose network each uses.
+_NETWORK_OF = {"frame": "frame", "tool": "tool", "again": "tool"} | dict.fromkeys(CLOSE, "closeup")
 #: The fields that a weights file stores as plain values.
 _SETTINGS = ("frame_px", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
@@ -45,8 +47,6 @@ MISSING_BELOW = 0.05
 TRACKED_FROM = 0.5
 #: If the mean confidence of its landmarks is lower, the detector looks at an image again; chosen on validation images.
 _UNSURE = 0.5
-#: The stages that use closeups: the first closeup, a second one if the first moved the landmark far, and tracking.
-CLOSE = ("closeup", "closer", "tracking")
 #: If the mean height of a window's peaks is lower than this, the first stage's peaks at these scales give candidates.
 _GOOD_HEIGHT, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
 _SURE = 0.5  # after a search, or if a confidence of the first stage is lower, confidences become this times the peaks' height
@@ -57,8 +57,6 @@ _SWEEP_LENGTHS, _SWEEP_ANGLES = (0.21, 0.1), 6
 _SWEEP_FACTOR = 0.5  # on the confidence of a sweep's result, since the first stage did not confirm it
 #: Share of the tool's length.  A detection farther than this from the expected position is taken for another object.
 NEAR = 0.1
-#: Stages that use another stage's network.
-_NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 #: The second look at the tool averages the heatmaps of the window and of its mirror image: they are low if the two disagree.
 MIRRORED = "again"
 _Ground = Callable[[], np.ndarray] | None  # returns the images without the tool, as in `Detector.__call__`
@@ -109,12 +107,6 @@ class Landmarks:
         """(n,) bool: images whose landmarks have a low mean confidence."""
         return self.confidence.mean(1) < _UNSURE
 
-    def surest(self, other: Self) -> Self:
-        """Choose for each image these landmarks or the `other` ones, whichever have the higher mean confidence."""
-        result, better = Landmarks.join([self]), other.confidence.mean(1) > self.confidence.mean(1)
-        result.put(better, other[better])
-        return result
-
     def away(self, u: np.ndarray) -> np.ndarray:
         """(n, 3) bool: landmarks farther than `NEAR` from the expected positions u (n, 3, 2) px."""
         return np.linalg.norm(self.u - u, axis=2) > NEAR * tool_length_px(u)[:, None]
@@ -162,18 +154,18 @@ class Detector:
 
     def network_of(self, stage: str) -> Network:
         """The network of a stage, which several stages may share."""
-        return self.networks[_NETWORK_OF.get(stage, stage)]
+        return self.networks[_NETWORK_OF[stage]]
 
     @property
     def networks(self) -> dict[str, Network]:
         """The networks by stage, in the order of their use."""
-        return {stage: network for stage in _STAGES if (network := getattr(self, f"{stage}_network")) is not None}
+        owners = dict.fromkeys(_NETWORK_OF.values())
+        return {stage: network for stage in owners if (network := getattr(self, f"{stage}_network")) is not None}
 
     @property
     def stages(self) -> list[str]:
         """The stages in the order of their use, each with an error model; the last one, if any, is tracking."""
-        names = ("frame", "tool", "again", "closeup", "closer", "tracking")
-        return [name for name in names if _NETWORK_OF.get(name, name) in self.networks]
+        return [stage for stage, owner in _NETWORK_OF.items() if owner in self.networks]
 
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
@@ -188,7 +180,7 @@ class Detector:
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
-        if other := metadata["networks"].keys() - set(_STAGES):
+        if other := metadata["networks"].keys() - set(_NETWORK_OF.values()):
             raise ValueError(f"{path}: it has networks of unknown stages ({', '.join(sorted(other))}); train it anew.")
         configs = metadata["networks"].items()
         networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
@@ -261,7 +253,8 @@ class Detector:
             if len(unsure := np.flatnonzero(result.doubtful)):
                 other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
                 other = other if k < len(looks) else replace(other, confidence=_SWEEP_FACTOR * other.confidence)
-                result.put(unsure, result[unsure].surest(other))
+                surer = other.confidence.mean(1) > result.confidence[unsure].mean(1)
+                result.put(unsure[surer], other[surer])
         return result
 
     def _once(self, images: np.ndarray, sweep: bool = False) -> Landmarks:
@@ -343,7 +336,7 @@ class Detector:
             best = np.argsort(-likelihood(u, once))[:_SECOND_LOOKS]
             u, twice = self._looked(images[i], u[best], "again")
             chosen = likelihood(u, twice).argmax()
-            result.put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
+            result.u[i], result.covariance[i] = tools[best[chosen]], np.nan
             height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))

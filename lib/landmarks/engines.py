@@ -24,7 +24,6 @@ from lib import files, paths
 from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import Network
 
-#: ``"openvino"`` chooses the faster precision for the processor.
 ENGINES = ("torch", "cuda", "openvino", "openvino float32", "openvino bfloat16")
 _BATCH = 6  # images in one inference request
 _FREQUENT, _ANY_SHAPE = 300, (-1, 3, -1, -1)  # for a shape that is used more often, compiling for it alone pays

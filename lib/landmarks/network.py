@@ -18,7 +18,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.nn.utils.fusion import fuse_conv_bn_weights
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lib.correspondences import LANDMARKS
 from lib.geometry import check
@@ -85,14 +85,12 @@ class Network(nn.Module):
 
     def fused(self) -> Self:
         """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
-        network = copy.deepcopy(self, {id(part): part for part in self.modules() if isinstance(part, nn.BatchNorm2d)})
+        network = copy.deepcopy(self).eval()
         for module in [part for part in network.modules() if isinstance(part, nn.Sequential)]:
             for i in range(len(module) - 1):
                 if isinstance(conv := module[i], nn.Conv2d) and isinstance(norm := module[i + 1], nn.BatchNorm2d):
-                    known = norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
-                    conv.weight, conv.bias = fuse_conv_bn_weights(conv.weight, conv.bias, *known)
-                    module[i + 1] = nn.Identity()
-        return network.eval().to(memory_format=torch.channels_last)
+                    module[i], module[i + 1] = fuse_conv_bn_eval(conv, norm), nn.Identity()
+        return network.to(memory_format=torch.channels_last)
 
 
 class _Block(nn.Module):

@@ -161,12 +161,11 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
         raise ValueError(f"population: one of {', '.join((*POPULATIONS, *FAR))}, got {population!r}.")
     if unknown := set(without) - {name for known in TRAINING.values() for name in known}:
         raise ValueError(f"without: no such family in training: {', '.join(sorted(unknown))}.")
-    choices = {aspect: {n: draw for n, draw in known.items() if n not in without} for aspect, known in TRAINING.items()}
+    ordinary = _ORDINARY if population in FAR else {}  # one aspect, or all, is new; the others are ordinary
+    choices = {aspect: {n: draw for n, draw in known.items() if n in ordinary.get(aspect, known) and n not in without}
+               for aspect, known in TRAINING.items()}  # fmt: skip
     if empty := [aspect for aspect, known in choices.items() if not known]:
         raise ValueError(f"without: leaves no family of {', '.join(empty)}.")
-    if population in FAR:  # one aspect, or all, is new; the others are ordinary
-        choices = {aspect: {n: draw for n, draw in known.items() if n in _ORDINARY.get(aspect, known)}
-                   for aspect, known in choices.items()}  # fmt: skip
     return choices | {aspect: {population: draw} for aspect, draw in FAR.get(population, {}).items()}
 
 

@@ -113,8 +113,7 @@ def render_view(
     for patch in lighting.patches:
         if patch.role == "glare":  # behind the tool
             patch.lay(linear, window)
-    sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(z))  # stated at 100 px per mm
-    linear = blur_by_depth(linear, sigma, grid)
+    linear = blur_by_depth(linear, microscope.blur_px(z, window.zoom), grid)
 
     u, visibility = np.full((3, 2), np.nan), np.zeros(3, int)
     if has_tool:

@@ -84,9 +84,10 @@ class Microscope:
             cameras.append(NearAffineCamera(matrix, near, centre_px) if near else AffineCamera(matrix))
         return StereoRig(*cameras).moved(robot_from_microscope)
 
-    def defocus_px(self, z_mm: np.ndarray) -> np.ndarray:
-        """Standard deviation in px of the defocus at depth z, at 100 px per mm: 1 at the ends of the depth of field."""
-        return np.abs(np.asarray(z_mm) - self.focus_z_mm) / (self.depth_of_field_mm / 2)
+    def blur_px(self, z_mm: np.ndarray, zoom: float) -> np.ndarray:
+        """Standard deviation in px of point spread and defocus at depth z, in an image of `zoom` px per mm."""
+        defocus_px = np.abs(z_mm - self.focus_z_mm) / (self.depth_of_field_mm / 2)  # at 100 px per mm
+        return np.hypot(self.psf_px, zoom / 100.0 * defocus_px)
 
 
 def reference_rig(*, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE, **geometry: object) -> StereoRig:

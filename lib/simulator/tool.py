@@ -189,7 +189,7 @@ def compose(
     # The depth along the view equals z of the microscope frame to a few um.  Around the tool, use that of the tool near by.
     covered = alpha > 0.01
     spread = cv2.blur(np.where(covered, depth, 0), (25, 25)) / np.maximum(cv2.blur(np.float32(covered), (25, 25)), 1e-3)
-    sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(np.where(covered, depth, spread)))
+    sigma = microscope.blur_px(np.where(covered, depth, spread), window.zoom)
     sigma = cv2.copyMakeBorder(sigma.astype(np.float32), *pad, cv2.BORDER_REPLICATE)
     layer = motion_blur(blur_by_depth(layer, sigma), shift)
     target = linear[y0 - pad[0] : y0 + height + pad[1], x0 - pad[2] : x0 + width + pad[3]]

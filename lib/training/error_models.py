@@ -136,16 +136,15 @@ def seen_by(detector: Detector, stage: str, labelled: LabelledImage, rough: Land
     peaks, matrices, which = found
     landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
     before = None if stage in ("frame", "tracking") else Rough.in_windows(rough.u, rough.confidence, matrices, which)
-    features = features_of(peaks.double(), before)
-    feature, moved = features[:, 0].numpy(), np.zeros(at.shape)
-    keep = np.ones(len(at), bool)
+    features = features_of(peaks.double(), before)[:, 0].numpy()
+    keep, moved = np.ones(len(at), bool), np.zeros(at.shape)
     if stage in CLOSE:
         keep = peaks.value[:, 0].numpy() > 0
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
     zoom = np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
     tolerance, label_sd = zoom * tolerance[landmark], zoom * label_sd[landmark]
-    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved, known[landmark], label_sd)))
+    return Seen(*(part[keep] for part in (features, errors, tolerance, landmark, moved, known[landmark], label_sd)))
 
 
 def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> ErrorModel:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import compress, islice
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -290,12 +290,9 @@ class Run:
         if self.average is not None:
             # The decay is smaller in the first steps, so that the average forgets the random initial weights.
             decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-            means, values = (list(network.state_dict().values()) for network in (self.average, self.network))
-            blended = [mean.is_floating_point() for mean in means]
-            get_ema_multi_avg_fn(decay)(list(compress(means, blended)), list(compress(values, blended)), None)
-            for mean, value in zip(means, values, strict=True):
-                if not mean.is_floating_point():  # a count
-                    mean.copy_(value)
+            pairs = zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True)
+            means, values = zip(*(pair for pair in pairs if pair[0].is_floating_point()), strict=True)  # counts are not read
+            get_ema_multi_avg_fn(decay)(means, values, None)
         self.step += 1
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
