@@ -435,7 +435,7 @@ class Case:
         return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], explained, _gain(*evidence), images, evidence)
 
 
-def compared(found: list[Hypothesis], of_frames: tuple[str, ...] = ()) -> list[Hypothesis]:
+def compared(found: list[Hypothesis], of_frames: tuple[str, ...]) -> list[Hypothesis]:
     """Make the gains comparable: all hypotheses that are named use the smallest design effect among them.
 
     So do causes of one or two parameters: where other faults remain, their own design effect is too large.  Causes named in
