@@ -100,12 +100,12 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     if not np.isfinite(time).all() or np.ptp(time) == 0:
         return
     share = (time - time.mean()) / np.ptp(time)
-    late = share[:, None, None, None, None, None] * case.problem.of_cameras
+    changes = case.problem.of_change(share)
     cure = "Fix the microscope and the robot, or calibrate shorter parts (--frames A:B)."
     for columns, what in (
-        (late[..., 3].reshape(len(time), 2, 2, -1), "images creep"),
+        (changes[..., 3::4], "images creep"),  # the cameras' offsets alone
         (case.problem.of_motion(share), "cameras turn or move steadily together: the images change"),
-        (late.reshape(len(time), 2, 2, -1), "cameras turn, zoom or move steadily: the images change"),
+        (changes, "cameras turn, zoom or move steadily: the images change"),
     ):
         fit = case.linear(columns)
         moved_px = fit.moved_px[case.problem.used]
@@ -170,7 +170,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     yield slip if fit.total > both.total - AS_GOOD else replace(slip, gain=0.0)
     together = case.linear(problem.of_motion(late[:, 0]))
     for views, fit in (((0, 1), both), ((0, 1), together), ((0,), None), ((1,), None)):
-        fit = fit or case.linear(problem.of_later_cameras(frame, views))
+        fit = fit or case.linear(problem.of_change(late[:, 0], views))
         rows = problem.used[:, views] & late
         size = float(np.sqrt((fit.moved_px[:, views][rows] ** 2).sum() / max(rows.sum(), 1)))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
