@@ -179,10 +179,9 @@ class Problem:
             start = best.start
         return self._descend(start, columns, apart, rounds)
 
-    def of_later_cameras(self, frame: int, views: tuple[int, ...] = (0, 1)) -> np.ndarray:
-        """(n, 2, 2, 8 per view): derivatives of the pixels by a change of the cameras of `views` from `frame` on."""
-        late = np.where((self.frame >= frame)[:, None, None, None, None, None], self.of_cameras[:, :, :, views], 0.0)
-        return late.reshape(len(self), 2, 2, -1)
+    def of_change(self, share: np.ndarray, views: tuple[int, ...] = (0, 1)) -> np.ndarray:
+        """`columns` of `fit` (n, 2, 2, 8 per view) for a change of the cameras of `views`, scaled by `share` (n,) of rows."""
+        return (share[:, None, None, None, None, None] * self.of_cameras[:, :, :, views]).reshape(len(self), 2, 2, -1)
 
     def of_motion(self, share: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """`columns` of `fit` for a turn and a shift of all landmarks together (6 numbers), scaled by `share` (n,) of rows."""
@@ -207,19 +206,19 @@ class Problem:
 
         @cache
         def cut_at(frame: int) -> Robust:
-            return self.fit(self.of_later_cameras(frame), start=fit.start, rounds=_TRIAL_ROUNDS)
+            return self.fit(self.of_change(self.frame >= frame), start=fit.start, rounds=_TRIAL_ROUNDS)
 
         cut, step = int(remaining.argmin()) + 2, max(frames // 5, 1)
         while step:
             best = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: cut_at(frame).total)
             step, cut = step if best != cut else step // 2, best
-        return cut, self.fit(self.of_later_cameras(cut), start=cut_at(cut).start)
+        return cut, self.fit(self.of_change(self.frame >= cut), start=cut_at(cut).start)
 
     def similar_cuts(self, cut: int, best: Robust) -> tuple[int, int]:
         """First and last frame around the likeliest `cut` at which the change of cameras in `best` may have come."""
 
         def may_be(frame: int) -> bool:
-            other = self.fit(self.of_later_cameras(frame), start=best.start, rounds=_TRIAL_ROUNDS)
+            other = self.fit(self.of_change(self.frame >= frame), start=best.start, rounds=_TRIAL_ROUNDS)
             return best.total - other.total < _SURE_CUT
 
         earlier, later = range(cut - 1, 1, -1), range(cut + 1, int(self.frame.max()))
@@ -435,7 +434,7 @@ class Case:
         return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], explained, _gain(*evidence), images, evidence)
 
 
-def compared(found: list[Hypothesis], of_frames: tuple[str, ...] = ()) -> list[Hypothesis]:
+def compared(found: list[Hypothesis], of_frames: tuple[str, ...]) -> list[Hypothesis]:
     """Make the gains comparable: all hypotheses that are named use the smallest design effect among them.
 
     So do causes of one or two parameters: where other faults remain, their own design effect is too large.  Causes named in

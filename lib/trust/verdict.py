@@ -351,18 +351,16 @@ def assess(
         features = calibration.pair.triangulate(y[:, :2], y[:, 2:])
         known = np.isfinite(features.x_mm).all(axis=1)
         epipolar_px, at_mm = float(np.median(np.abs(features.epipolar_px))), features.x_mm[known] if known.any() else None
-    straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
-    if near:  # then lens distortion is no fault either, and positions behind a camera are not visible
-        left, right = calibration.cameras
-        behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
-        data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
-    missed = []
+    missed, straight, near = [], data, fit is calibrate_as_shown  # it would have found a distance itself
     if calibration is not None:
+        (left, right), near = calibration.cameras, calibration.inverse_distance_per_mm[1] > 0
+        if near:  # then lens distortion is no fault either, and positions behind a camera are not visible
+            behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
+            data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         missed = _missed(data, calibration, recording.image_size_px)
         straight = data = _in_view(data, calibration, recording.image_size_px)
-    if near:
-        straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
-    near |= calibration is None and fit is calibrate_as_shown  # it would have found a distance itself
+        if near:
+            straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated(recording))
     diagnosis = with_footage(with_scene(diagnosis, recording, data.frame), recording, data)
     if turned := turned_images(recording, np.unique(data.frame)):  # they look like many causes, and none of these matters
