@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from lib.correspondences import Correspondences
 from lib.matching import dark_mask
@@ -21,7 +22,9 @@ _OF_TIMES = (
     "clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "robot_wanders", "smoothed_log", "frozen_video",
 )  # fmt: skip
 _LOOKED_AT, _AROUND = 8, 0.3  # images in which combs are looked for; margin around the tool, as a share of its extent
-_COMBED = 3.0  # least ratio of jagged rows to jagged columns; in images of one instant it is 0.9 to 1.8
+#: Steps from row to row that alternate in a comb, more than at a thin line; what is added to both means of them, in grey
+#: levels; least ratio of jagged rows to jagged columns.  It is 0.3 to 1.7 in 68 recordings with images of one instant.
+_ALTERNATE, _EVEN, _COMBED = 4, 0.03, 2.5
 _STRETCHES, _STRETCH = 3, 13  # stretches of consecutive images that are compared, and their lengths
 #: An image repeats if it differs from the one before by less than the first share of the usual change, although the robot
 #: moved by more than the second share of its usual step.  Fewer repeats than the last share do little harm.
@@ -164,7 +167,7 @@ def _interlaced(best: Hypothesis, recording: Recording, data: Correspondences) -
             margin = _AROUND * np.ptp(u[i], axis=0).max() * np.array([[-1], [1]])
             (left, top), (right, bottom) = np.maximum([u[i].min(axis=0), u[i].max(axis=0)] + margin, 0).astype(int)
             tool = recording.frames[int(frames[i])].left[top:bottom, left:right].sum(axis=2, dtype=np.float32)
-            ratios.append(_jagged(tool) / max(_jagged(tool.T), 1e-9))
+            ratios.append((_jagged(tool) + _EVEN) / (_jagged(tool.T) + _EVEN))
     if not ratios or np.median(ratios) < _COMBED:
         return None
     text = "The images are interlaced: their odd rows show the tool at another instant than their even rows."
@@ -173,9 +176,13 @@ def _interlaced(best: Hypothesis, recording: Recording, data: Correspondences) -
 
 
 def _jagged(image: np.ndarray) -> float:
-    """How much each row differs from both its neighbours alike."""
-    both = (image[1:-1] - image[:-2]) * (image[1:-1] - image[2:])
-    return float(np.maximum(both, 0).mean()) if both.size else 0.0
+    """Mean size of the steps between rows that alternate, up and down, at least `_ALTERNATE` times."""
+    steps = np.diff(image, axis=0)
+    steps[1::2] *= -1
+    if len(steps) < _ALTERNATE:
+        return 0.0
+    runs = sliding_window_view(steps, _ALTERNATE, axis=0)
+    return float((np.maximum(runs.min(axis=-1), 0) - np.minimum(runs.max(axis=-1), 0)).mean())
 
 
 def _repeated(best: Hypothesis, recording: Recording, data: Correspondences) -> Hypothesis | None:

@@ -38,6 +38,14 @@ def interlaced(images):
     return [np.where(rows, image, np.roll(image, 4, axis=1)) for image in images]
 
 
+def with_thin_lines(images):
+    """Level lines of one row, as the rim of a tool or a thread."""
+    lines = [image.copy() for image in noisy(images)]
+    for line in lines:
+        line[::9] //= 3
+    return lines
+
+
 def noisy(images):
     rng = np.random.default_rng(0)
     return [cv2.add(image, rng.integers(0, 6, image.shape, dtype=np.uint8)) for image in images]
@@ -90,7 +98,8 @@ def test_detections_that_turn_in_one_image_only_accuse_no_log(recording):
 
 
 @pytest.mark.parametrize(("edit", "name", "cure"), [
-    (noisy, "clock", "Set offset_s."), (interlaced, "interlaced", "even rows"), (pulled_down, "frozen_video", "Drop images"),
+    (noisy, "clock", "Set offset_s."), (with_thin_lines, "clock", "Set offset_s."),
+    (interlaced, "interlaced", "even rows"), (pulled_down, "frozen_video", "Drop images"),
 ])  # fmt: skip
 def test_a_defect_of_the_images_is_named_in_place_of_the_clock(recording, edit, name, cure):
     best = named(recording, CLOCK, edit)
