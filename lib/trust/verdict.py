@@ -73,6 +73,7 @@ _LABEL_PX = 3.0
 #: Cameras have not moved if landmarks shift by more than `_NEARER_PX` plus `_TIMES` the shift of the scene, px: the tool is
 #: nearer than the scene, but not by that much.  A scene that shifts by more than `_MOVED_PX` does not stand still.
 _NEARER_PX, _TIMES, _MOVED_PX = 1.0, 2.0, 5.0
+_WATCHED = 5  # frames in which the scene is compared if the robot seems to wander
 _SHAFT_FRAMES = 24  # frames in which the end of the shaft is measured
 #: Least share of the images with a landmark, by robot and cameras, in which the detector finds it; and fewest such images.
 _LEAST_FOUND, _FEWEST_SHOWN = 0.5, 16
@@ -410,14 +411,20 @@ def _in_view(data: Correspondences, c: Calibration, size_px: tuple[int, int]) ->
 def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:
     """The diagnosis of some frames, corrected by the scene behind the tool, which moves only if a camera does."""
     best = diagnosis.best
-    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift"):
+    if best is None or best.name not in ("camera_moved", "tool_slipped", "drift", "robot_wanders"):
         return diagnosis
-    pairs = (recording.frames[int(i)] for i in (frames.min(), frames.max()))
-    first, last = (Scene.of(pair.left, pair.right) for pair in pairs)
-    moved_px = first.moved_px(last)[list(best.images)]  # NaN decides nothing
+    frames = np.unique(frames)
+    pairs = (recording.frames[int(i)] for i in frames[spread(len(frames), _WATCHED if best.name == "robot_wanders" else 2)])
+    first, *later = (Scene.of(pair.left, pair.right) for pair in pairs)
+    moved_px = np.max([first.moved_px(scene) for scene in later], axis=0)[list(best.images)]  # NaN decides nothing
     others = [h for h in diagnosis.hypotheses if h.name != best.name]
+    moves = (moved_px > _MOVED_PX).all()
+    if best.name == "robot_wanders":
+        does = "moves, too: eye, microscope or images (stabilisation) move" if moves else "stands still: robot or tool err"
+        found = replace(best, text=f"{best.text} The scene behind the tool {does}.")
+        return Diagnosis((found, *others)) if moves or (moved_px <= _MOVED_PX).all() else diagnosis
     if best.name == "tool_slipped":
-        return Diagnosis(tuple(others)) if (moved_px > _MOVED_PX).all() else diagnosis
+        return Diagnosis(tuple(others)) if moves else diagnosis
     if not ((best.value > _NEARER_PX + _TIMES * moved_px) & (moved_px < _MOVED_PX)).all():  # a turned image moves far
         return diagnosis
     if best.name == "drift":

@@ -398,6 +398,19 @@ def test_a_scene_that_stands_still_tells_a_robot_that_drifts_from_cameras_that_d
     assert "drift" in names and "robot_drifts" not in names
 
 
+@pytest.mark.parametrize(("moved_px", "told"), [
+    ((0.2, 14.0, 20.0), "moves, too"), ((0.2, 1.0, 0.4), "stands still"), ((0.2, np.nan, 9.0), ""),
+])  # fmt: skip
+def test_a_robot_that_wanders_is_told_whether_the_scene_moves_meanwhile(decoded_once, monkeypatch, moved_px, told):
+    """Between the first and the last frame nothing has to move."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    shifts = iter([*np.repeat(moved_px, 2).reshape(-1, 2), np.zeros(2)])
+    monkeypatch.setattr(Scene, "moved_px", lambda *_: next(shifts))
+    found = Hypothesis("robot_wanders", "It errs.", "Hold it.", 440.0, 0.0, "um", explained=0.9, gain=100.0)
+    best = verdicts.with_scene(Diagnosis((found,)), recording, np.arange(len(recording))).best
+    assert best.text.startswith("It errs.") and told in best.text and ("scene" in best.text) == bool(told)
+
+
 @pytest.mark.parametrize("doubted", ["repeated_samples", "bursts"])
 @pytest.mark.parametrize(("name", "mended"), [("time_stamps", True), ("robot_wanders", True), ("camera_moved", False)])
 def test_a_log_that_repeats_its_positions_or_comes_in_bursts_is_mended_before_the_times(name, mended, doubted):
