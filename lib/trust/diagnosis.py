@@ -35,6 +35,7 @@ _RESTS, _RESTS_MM = 4, 0.06  # a tool rests if its landmarks moved less than 0.0
 _UNFIT_SHARE, _UNFIT_ONE, _UNFIT_FEWEST = 0.2, 0.35, 16
 #: Least share of gross errors in the images of one eye, and largest share in the other's, if only the one eye is in doubt.
 _ONE_EYE, _OTHER_EYE = 0.6, 0.2
+_EXCHANGE = "Exchange the images of these frames between left/ and right/."
 _OF_PIXELS = ("scaled_axis", "odd_pixels")
 _OF_TIME = ("clock", "clock_rate", "frame_order")
 _NEARLY = 0.05  # share of the residuals: causes that explain this much less still compete
@@ -130,6 +131,8 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
         when = "{} to {} ({:.2f} to {:.2f} s)".format(*problem.number[[first, last - 1]], *problem.time[rows][[0, -1]])
         cure = "Look at these frames and the robot's log of this time, or leave its cells in kinematics.csv blank there."
         parts.append(("bad_stretch", rows, 4, f"Frames {when} have", cure))
+        fit, share = _exchanged(problem, rows).fit(start=case.null.start), (100 * rows.mean(), 0.0, "%")
+        yield case.found("exchanged_eyes", fit, 4, share, f"In frames {when} the left image is the right one.", _EXCHANGE)
     for name, rows, extra, what, cure in parts:
         inside, outside = problem.used & rows[:, None], problem.used & ~rows[:, None]
         if not inside.any() or not outside.any():
@@ -142,6 +145,12 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
             yield case.found(name, fit, extra, (ratio, 0.0, "times"), text, cure)
 
 
+def _exchanged(problem: Problem, rows: np.ndarray) -> Problem:
+    """The problem with left and right exchanged in the `rows` (n,) bool."""
+    y, seen = (np.where(rows.reshape(-1, *[1] * (v.ndim - 1)), v[:, ::-1], v) for v in (problem.y, problem.seen))
+    return replace(problem, y=y, seen=seen)
+
+
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     """A change at one frame: one camera or both moved, the images were exchanged, or the tool slipped in its holder."""
     problem = case.problem
@@ -149,16 +158,13 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         return
     frame, both = problem.other_cameras(case.null)
     late = (problem.frame >= frame)[:, None]
-    y = np.where(late[..., None], problem.y[:, ::-1], problem.y)
-    exchanged = replace(problem, y=y, seen=np.where(late, problem.seen[:, ::-1], problem.seen))
     changes = both.total - case.null.total > _SURE_CHANGE  # else no hypothesis is named, and the search would take long
     number, first, last = problem.number[[frame, *(problem.similar_cuts(frame, both) if changes else (frame, frame))]]
     parts = f"--frames {problem.number[0]}:{first}, --frames {last}:{problem.number[-1] + 1}"
     when = f"at about frame {number}" + (f" ({first} to {last})" if first < last else "")  # in the recording
     text = f"From about frame {number} on, the left image is the right one."
-    cure = "Exchange the images of these frames between left/ and right/."
-    fit = exchanged.fit(start=both.start)
-    yield case.found("exchanged_eyes", fit, 3, (100 * late.mean(), 0.0, "%"), text, cure)
+    fit = _exchanged(problem, late[:, 0]).fit(start=both.start)
+    yield case.found("exchanged_eyes", fit, 3, (100 * late.mean(), 0.0, "%"), text, _EXCHANGE)
     slipped = problem.axes * late[..., None]
     fit = case.linear(by_steps(slipped))
     size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)

@@ -362,6 +362,17 @@ def test_clocks_of_different_rates_are_not_said_to_differ_by_a_constant():
     assert best.name == "clock_rate" and best.value == pytest.approx(1.01, abs=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_where_a_detector_marks_what_stands_still_time_does_not(seed):
+    """At a rate of almost nothing all frames would show one instant, and any cameras would fit."""
+    usual = take(frames=40, seed=seed)
+    still = usual.data.u_left[:3], usual.data.u_right[:3]
+    rng = np.random.default_rng(seed)
+    left, right = (np.tile(u, (40, 1)) + rng.normal(0, 2.0, (120, 2)) for u in still)
+    hypotheses = found(replace(usual, data=replace(usual.data, u_left=left, u_right=right))).hypotheses
+    assert all(0.3 < abs(one.value) < 2.5 for one in hypotheses if one.name == "clock_rate")
+
+
 def test_a_small_error_of_the_frame_rate_is_named():
     best = found(take(rate=1.02, frames=60)).best
     assert best.name == "clock_rate" and best.value == pytest.approx(1 / 1.02, abs=1e-3)
@@ -520,6 +531,24 @@ def _hidden(scene, u):
     """Nine frames in which the tool is out of view, and the detector marks something at rest."""
     gone = u[27] + 300.0 + scene.rng.normal(0, 3, (9, *u.shape[1:]))
     return np.concatenate([u[:27], gone, u[36:]])
+
+
+@pytest.mark.parametrize(("first", "last"), [(13, 19), (21, 40)])
+def test_eyes_that_are_exchanged_for_some_frames_are_named(first, last):
+    usual = take(frames=60)
+    own = ((usual.data.frame >= first) & (usual.data.frame <= last))[:, None]
+    left, right = usual.data.u_left, usual.data.u_right
+    rows = replace(usual.data, u_left=np.where(own, right, left), u_right=np.where(own, left, right))
+    best = found(replace(usual, data=rows)).best
+    assert best.name == "exchanged_eyes" and best.text.startswith(f"In frames {first} to {last} (")
+    assert best.value == pytest.approx((last - first + 1) / 0.6) and "between left/ and right/" in best.cure
+
+
+def test_an_error_that_no_eye_wanders_is_not_blamed_on_the_eye():
+    usual = take(frames=60)
+    phase = 2 * np.pi * (usual.kinematics.time_s - usual.kinematics.time_s[0])[:, None] / [3.1, 2.3, 4.4]
+    cures = [h.cure for h in found(with_log_off(usual, 4.0 * np.sin(phase))).hypotheses if h.name == "robot_wanders"]
+    assert cures and all("rotations" in cure and "eye" not in cure for cure in cures)
 
 
 def test_detections_of_a_tool_out_of_view_belong_to_no_other_instant():
