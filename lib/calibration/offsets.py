@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
-from lib.calibration.robust import CompetingCamerasError, LooseCameraError, consensus
+from lib.calibration.robust import LooseCameraError, NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.correspondences import Correspondences, DataError
@@ -208,7 +208,7 @@ def estimate_offsets(
     pixels (n, m), with inlier `views`, and a Schur complement.  An `Unsettled` warning says that `iterations` are too few.
     `start` gives the first offsets, their prior and p-value.  Without `prior_sd` the prior's width is the one of maximum
     evidence, between 0.1 and 300 um or 0.01 and 30 px.
-    If rows agree only loosely, two cameras compete, or one landmark is mostly an outlier, small offsets may be the reason.
+    If rows agree on no camera, or one landmark is mostly an outlier, small offsets may be the reason.
     Else the `NoConsensusError` is raised, or the calibration without that landmark returned.
     """
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
@@ -217,13 +217,19 @@ def estimate_offsets(
     found, competing, attempts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
     try:
         found = steps()
-    except (CompetingCamerasError, LooseCameraError) as error:
+    except NoConsensusError as error:
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found
     if isinstance(competing, LooseCameraError):  # wrong detections far outside its noise would spoil the offsets
         with suppress(DataError):
             attempts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
+    elif competing:  # each landmark agrees with itself, whatever its offset
+        alone = np.zeros_like(attempts[0])
+        for rows in (landmark == k for k in np.unique(landmark)):
+            with suppress(DataError):
+                alone[rows] = consensus(x[rows], y[rows], None, np.random.default_rng(0))[0]
+        attempts = [alone]
     for first_views in attempts:
         with suppress(*_FAILURES), warnings.catch_warnings(action="error", category=Unsettled):
             other = steps(first_views=first_views)

@@ -199,6 +199,19 @@ def test_landmarks_that_are_off_are_no_cameras_that_compete(seed):
     assert calibrate(replace(data, confidence=without)).view_inliers[data.landmark != 1].all()
 
 
+@pytest.mark.parametrize(("seed", "share"), [(0, 0.2), (12, 0.2), (5, 0.2), (3, 0.3), (39, 0.3)])
+def test_landmarks_that_are_off_are_told_from_other_cameras_beside_wrong_detections(seed, share):
+    """Each landmark agrees with itself, so that wrong detections, a share of all, cannot spoil the first offsets."""
+    offset = np.array([[0.02, -0.15, 0.0], [-0.05, 0.3, 0.04], [0.05, 0.11, -0.03]])
+    data = tool_sweep(seed, turn_rad=0.05, offset_mm=offset, sigma_px=0.5)[0]
+    rng = np.random.default_rng(seed)
+    wrong = rng.random((len(data), 2)) < share
+    left, right = (np.where(w[:, None], u + rng.uniform(-300, 300, u.shape), u)
+                   for w, u in zip(wrong.T, (data.u_left, data.u_right), strict=True))  # fmt: skip
+    found = calibrate(replace(data, u_left=left, u_right=right))
+    assert found.view_inliers[~wrong].mean() > 0.95 and found.reprojection_rms_px < 2
+
+
 @pytest.mark.parametrize(
     ("seed", "turn_rad", "size_mm"), [(5, 0.4, 0.2), (1, 0.2, 0.2), (2, 0.2, 0.5), (5, 0.05, 0.5)],
     ids=["a landmark left out", "cameras that compete", "far off: loose", "far off: cameras that compete"],
