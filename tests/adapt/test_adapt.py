@@ -13,18 +13,20 @@ import cv2
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.adapt import RefusalError, adapt, alignment, images, judging, looking, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import at_rest, exchanged_tips, look_elsewhere
 from lib.calibration.offsets import Unsettled, carried, tool_axes
-from lib.correspondences import DataError
+from lib.correspondences import DataError, of_recording
 from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.recorded import Seen, look
 from lib.landmarks.shaft import AHEAD, ShaftEnd
-from lib.recordings import Frames, Kinematics, Scene
+from lib.recordings import Frames, Kinematics, Recording, Scene
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from lib.trust import Diagnosis, Hypothesis
 from tests.adapt.world import SIZE, Kept, StandIn, World, pupil
 from tests.remembering import remembering_teacher
 
@@ -1134,3 +1136,13 @@ def test_epipolar_lines_of_the_eye_hold_for_a_tool_that_is_nearer(monkeypatch):
     off = seen._replace(u=u + rng.normal(0, 10, u.shape))
     right, wrong = judging.epipolar_px(None, [seen.of(np.arange(30, 40)), off.of(np.arange(30, 40))], seen.of(np.arange(30)))
     assert np.median(right) < 0.5 and np.median(wrong) > 4
+
+
+@pytest.mark.parametrize(("explained", "refused"), [(0.75, False), (0.9, True)])
+def test_pixels_that_a_wrong_scale_explains_in_part_are_the_detectors(monkeypatch, explained, refused):
+    """A detector's errors that depend on the pose make pixels look odd, too; they refused a good robot."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    found = Hypothesis("scaled_axis", "It errs.", "Divide x.", 1.057, 0.01, "times", explained=explained, gain=27.0)
+    monkeypatch.setattr(alignment, "diagnose", lambda *_, **__: Diagnosis((found,)))
+    rows = of_recording(recording, recording.truth.u_left, recording.truth.u_right)
+    assert (alignment.likeliest_fault(recording, rows, None) is not None) == refused
