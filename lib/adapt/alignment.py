@@ -33,7 +33,7 @@ _NEARLY_ALL = 0.8  # share of inliers among the detections, above which no other
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Faults that disqualify the robot as a teacher, each with the least share of the residuals that it must explain.  A
 #: detector's error that depends on the tool's pose looks like a slow drift of the robot; it explained up to 0.28 of them.
-#: Or like an axis of a wrong scale, which explained up to 0.75 of the pixels' oddness there; 0.89 or more if it was wrong.
+#: It can look like an axis of a wrong scale, too: that explained 0.75 of the oddness of pixels; errors of 3 to 6 %, 0.91.
 #: Errors from frame to frame were never the likeliest cause in 15 recordings of good robots by unfamiliar renderers.
 _FAULTS = dict.fromkeys((
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",

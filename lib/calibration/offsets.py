@@ -214,17 +214,17 @@ def estimate_offsets(
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
     if axes is None:
         return steps()
-    found, competing, attempts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
+    found, refused, attempts = None, None, [np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)]
     try:
         found = steps()
     except NoConsensusError as error:
-        competing = error
+        refused = error
     if found is not None and _agree_alike(found, landmark):
         return found
-    if isinstance(competing, LooseCameraError):  # wrong detections far outside its noise would spoil the offsets
+    if isinstance(refused, LooseCameraError):  # wrong detections far outside its noise would spoil the offsets
         with suppress(DataError):
-            attempts.insert(0, consensus(x, y, _FAR_OUT * competing.sigma_px, np.random.default_rng(0))[0])
-    elif competing:  # each landmark agrees with itself, whatever its offset
+            attempts.insert(0, consensus(x, y, _FAR_OUT * refused.sigma_px, np.random.default_rng(0))[0])
+    elif refused:  # each landmark agrees with itself, whatever its offset
         alone = np.zeros_like(attempts[0])
         for rows in (landmark == k for k in np.unique(landmark)):
             with suppress(DataError):
@@ -234,11 +234,11 @@ def estimate_offsets(
         with suppress(*_FAILURES), warnings.catch_warnings(action="error", category=Unsettled):
             other = steps(first_views=first_views)
             offset = other.offsets.offset[np.bincount(landmark) > 0]
-            most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
+            most, centre = (_MOST_MM, offset.mean(axis=0)) if refused else (_MOST_ALONE_MM, 0.0)
             if np.linalg.norm(offset - centre, axis=1).max() <= most and _agree_alike(other, landmark):
                 return other
-    if competing:
-        raise competing
+    if refused:
+        raise refused
     return found
 
 

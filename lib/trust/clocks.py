@@ -18,8 +18,8 @@ _LONGEST_S = 60.0  # largest half width of the wide search, made if the cameras 
 #: that jumps over one that does not.
 _WORTH = 20.0
 _LEAST_DRIFT = 5e-6  # smallest difference of a rate from 1 that is named; in half an hour it adds up to 9 ms
-_FAR_OFF = 0.01  # a rate that differs from 1 by more is only named if the cameras then fit,
-_NEAR_TRIED = 0.2  # and if it differs by less than this from the one that was tried
+#: A rate that differs from 1 by more is only named if the cameras then fit.  Rates outside these limits are never named.
+_FAR_OFF, _LIKELY = 0.01, (0.4, 2.5)
 _STAMPS_S, _STAMPS = (0.03, 0.06, 0.12), 31  # largest errors of the times of single frames, and number of trials up to each
 _ASTRAY = 10.0  # largest residual of frames of other instants, over the scale; at no instant do wrong detections fit so well
 _OUTSIDE = 0.25  # least share of frames outside the log if a clock is wrong; a log that only begins late misses fewer
@@ -101,8 +101,8 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     if (fitted := _refined(case, np.array([shift, rate - 1.0]), np.stack([np.ones(len(time)), time]))) is None:
         return
     fit, problem, (shift, value), (shift_sd, sd) = fitted
-    if abs(value) > _FAR_OFF and (case.misfit(fit) >= FITS or abs(1 + value - rate) > _NEAR_TRIED):
-        return  # by chance, part of a path passes near some frames, or time almost stands still
+    if not _LIKELY[0] < abs(1 + value) < _LIKELY[1] or (abs(value) > _FAR_OFF and case.misfit(fit) >= FITS):
+        return  # by chance, part of a path passes near some frames; or time stands still, and all frames show one instant
     if rate < 0:
         text, cure = "The images fit the robot's path run backwards.", "Sort the frames by time."
         yield case.found("frame_order", fit, 4, (0.0, 0.0, ""), text, cure, on=problem)

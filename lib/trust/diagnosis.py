@@ -147,8 +147,8 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
 
 def _exchanged(problem: Problem, rows: np.ndarray) -> Problem:
     """The problem with left and right exchanged in the `rows` (n,) bool."""
-    y, seen = (np.where(rows.reshape(-1, *[1] * (v.ndim - 1)), v[:, ::-1], v) for v in (problem.y, problem.seen))
-    return replace(problem, y=y, seen=seen)
+    y = np.where(rows[:, None, None], problem.y[:, ::-1], problem.y)
+    return replace(problem, y=y, seen=np.where(rows[:, None], problem.seen[:, ::-1], problem.seen))
 
 
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:

@@ -22,8 +22,8 @@ _OF_TIMES = (
     "clock", "clock_rate", "frame_order", "time_stamps", "robot_noise", "robot_wanders", "smoothed_log", "frozen_video",
 )  # fmt: skip
 _LOOKED_AT, _AROUND = 8, 0.3  # images in which combs are looked for; margin around the tool, as a share of its extent
-#: Steps from row to row that alternate in a comb, more than at a thin line; what is added to both means of them, in grey
-#: levels; least ratio of jagged rows to jagged columns.  It is 0.3 to 1.7 in 68 recordings with images of one instant.
+#: Number of steps from row to row that alternate in a comb (two do at a thin line); what is added to both means of their
+#: sizes, in grey levels; least ratio of rows to columns.  It is 0.5 to 1.5 in 77 recordings with images of one instant.
 _ALTERNATE, _EVEN, _COMBED = 4, 0.03, 2.5
 _STRETCHES, _STRETCH = 3, 13  # stretches of consecutive images that are compared, and their lengths
 #: An image repeats if it differs from the one before by less than the first share of the usual change, although the robot

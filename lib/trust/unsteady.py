@@ -26,7 +26,7 @@ _WANDERS = (
     "Does the eye roll, and with it the pivot of the shaft? Does the microscope sway, the shaft bend, or the robot drift? "
     "Hold what moves, or calibrate shorter parts (--frames A:B)."
 )
-_FAR_MM = 1.0  # farther than eyes and microscopes wander
+_FAR_MM = 1.0  # RMS, from which neither eye nor microscope is the reason
 _COSINES = (2, 4, 8)  # numbers of cosines that are tried
 #: Least share of the residuals that slow errors explain.  Errors of the detector that depend on the pose look alike; they
 #: explained up to 0.26 in good recordings.
@@ -113,7 +113,7 @@ def wanders(case: Case) -> Iterator[Hypothesis]:
         moved_px = np.einsum("cij,nj->nci", fit.M[:, :, :3], wandered_mm - wandered_mm.mean(axis=0))[problem.used]
         if size > case.robot_mm and np.sqrt((moved_px**2).sum(axis=1).mean()) > _claimed_px(case):
             text = f"Over seconds images and robot differ by {size:.2g} mm (RMS), equally for all landmarks."
-            cure = _WANDERS if size < _FAR_MM else f"Nothing wanders so far. {ROBOT_ERRS}"
+            cure = _WANDERS if size < _FAR_MM else f"Neither eyes nor microscopes move that far. {ROBOT_ERRS}"
             size_um, raw = (1e3 * size, 0.0, "um"), fit.total - late.total
             found.append(case.found("robot_wanders", fit, 3 * count, size_um, text, cure, raw=raw))
     by_clock = 1.0 - np.exp(-(late.total - case.null.total) / problem.used.sum())

@@ -409,7 +409,7 @@ def _in_view(data: Correspondences, c: Calibration, size_px: tuple[int, int]) ->
 
 
 def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -> Diagnosis:
-    """The diagnosis of some frames, corrected by the scene behind the tool, which moves only if a camera does."""
+    """The diagnosis of some frames, corrected by the scene behind the tool: if it stands still, so do the cameras."""
     best = diagnosis.best
     if best is None or best.name not in ("camera_moved", "tool_slipped", "drift", "robot_wanders"):
         return diagnosis
@@ -420,7 +420,7 @@ def with_scene(diagnosis: Diagnosis, recording: Recording, frames: np.ndarray) -
     others = [h for h in diagnosis.hypotheses if h.name != best.name]
     moves = (moved_px > _MOVED_PX).all()
     if best.name == "robot_wanders":
-        does = "moves, too: eye, microscope or images (stabilisation) move" if moves else "stands still: robot or tool err"
+        does = "moves, too: eye or microscope move, or images are stabilised" if moves else "stands still: robot or tool err"
         found = replace(best, text=f"{best.text} The scene behind the tool {does}.")
         return Diagnosis((found, *others)) if moves or (moved_px <= _MOVED_PX).all() else diagnosis
     if best.name == "tool_slipped":

@@ -548,7 +548,7 @@ def test_an_error_that_no_eye_wanders_is_not_blamed_on_the_eye():
     usual = take(frames=60)
     phase = 2 * np.pi * (usual.kinematics.time_s - usual.kinematics.time_s[0])[:, None] / [3.1, 2.3, 4.4]
     cures = [h.cure for h in found(with_log_off(usual, 4.0 * np.sin(phase))).hypotheses if h.name == "robot_wanders"]
-    assert cures and all("rotations" in cure and "eye" not in cure for cure in cures)
+    assert cures and all("rotations" in cure and "eye roll" not in cure for cure in cures)
 
 
 def test_detections_of_a_tool_out_of_view_belong_to_no_other_instant():
