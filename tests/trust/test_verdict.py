@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.calibration import calibrate
+from lib.calibration import CompetingCamerasError, calibrate
 from lib.correspondences import TRAIN_FURTHER, Correspondences, DataError, NoDetectionError, of_recording
 from lib.landmarks.shaft import ShaftEnd
 from lib.recordings import Doubt, Frames, Recording, Scene
@@ -176,6 +176,16 @@ def test_a_refusal_names_its_own_cure():
     (reason,) = judge(flat, None, error=error.value).reasons
     assert reason.name == "refused" and reason.cure == "Correct that, then check again."
     assert "cover a few depths as well" in reason.text
+
+
+def test_where_the_detector_errs_competing_cameras_may_be_its_errors():
+    parts = {"looks": np.repeat([[3.0], [0.1]], [8, 12], axis=0) * np.ones(3)}
+    few_bad = Health(np.arange(20), parts, np.ones((20, 3), bool))
+    error = CompetingCamerasError("left: two consensuses compete.")
+    (alone,) = judge(made(60), None, error=error).reasons
+    assert alone.cure == "Correct that, then check again."
+    reasons = judge(made(60), None, error=error, health=few_bad).reasons
+    assert [reason.name for reason in reasons] == ["no_consensus", "detector_unfit"] and "lib adapt" in reasons[0].cure
 
 
 def test_a_refusal_does_not_contradict_the_diagnosis():
