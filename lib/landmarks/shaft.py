@@ -52,10 +52,11 @@ AHEAD = np.array([1.0, 0.0, 0.0])  # the direction of a shaft that points to the
 _AROUND_PX, _GAP_PX, _BEHIND_PX = 121, 8.0, (38, 71)
 #: Largest angle from the direction of the tips, and factor by which the best energy exceeds the median of all directions.
 _WIDEST_DEG, _SHARP = 64, 3.0
-#: The edge of the end is rounded or bevelled by about a sixth of the radius, more or less.  So the base is nearer to the tips
-#: than the middle of the fitted ellipse, by this share of its half axis along the tool, with this standard deviation.  A wide
-#: shaft that is seen steeply does not show the base: there that is more than the third number, in tool lengths.
-_BEVEL, _BEVEL_SD, _LARGEST_BEVEL = 0.25, 0.15, 0.035
+#: The edge of the end is sharp, rounded or bevelled.  So the base is a little nearer to the tips than the middle of the
+#: fitted ellipse, by this share of its half axis along the tool, with this standard deviation; the share had a median of
+#: 0.06 to 0.11 in each of five groups of 9 to 12 recordings by other renderers.  A wide shaft that is seen steeply does not
+#: show the base: there this standard deviation is more than the third number, in tool lengths.
+_BEVEL, _BEVEL_SD, _LARGEST_BEVEL_SD = 0.1, 0.14, 0.025
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  Chosen, as all above, on
 #: fourteen recordings by other renderers and on validation recordings.  The neck of a tapered shaft goes on into the jaws.
 _SD, _SD_TAPERED, _SD_PX = 0.008, 0.02, 1.0
@@ -205,7 +206,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
         return None
     shown = _RADII_PX[k] * tangent / _LENGTH_PX  # half axis of the ellipse along the tool, in tool lengths
     clearest = np.mean([score[slope, k, :, i].max() for score in scores])
-    if k == len(_RADII_PX) - 1 or clearest < _LEAST or _BEVEL * shown > _LARGEST_BEVEL:
+    if k == len(_RADII_PX) - 1 or clearest < _LEAST or _BEVEL_SD * shown > _LARGEST_BEVEL_SD:
         return None
     before, at, after = best[i - 1 : i + 2]
     moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
