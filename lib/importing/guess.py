@@ -11,15 +11,17 @@ from itertools import product
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 
 from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import separator_of, text_of, topics_of, uncommented
-from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, quarters
+from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, pixel_aspect, quarters
 from lib.recordings.tables import read_toml
 
+_TALL, _WIDE = 1.1, 1.95  # width over height of a film with both views: below, on top of each other; above, side by side
 _LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|zeit|temps|tiempo|tempo|tijd|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
@@ -70,11 +72,8 @@ def guess_mapping(source: str | Path) -> str:
 def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> dict:
     films, images = ([n for n, path in paths.items() if path.suffix.lower() in kind] for kind in (VIDEOS, IMAGES))
     if len(films) == 1:
-        with av.open(str(paths[films[0]])) as container:
-            stream = container.streams.video[0]
-            shown = (stream.width, stream.height)[:: -1 if quarters(next(container.decode(stream), None)) % 2 else 1]
-            layout = "top_bottom" if shown[0] < 1.1 * shown[1] else "side_by_side"
-        return {"layout": layout, "file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
+        film = {"file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
+        return _layout(folder / films[0]) | film
     kinds = Counter((Path(name).parent / f"*{Path(name).suffix}").as_posix() for name in images)
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
     if not names:
@@ -92,6 +91,20 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> di
         times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}
     views = {"layout": "two", "left": left, "right": rights[0]} if rights else {"layout": "side_by_side", "file": left}
     return {**views, **times, "exchanged": False}
+
+
+def _layout(film: Path) -> dict:
+    """How a film holds both views.  One that has the shape of a single view holds squeezed halves; these look alike."""
+    with av.open(str(film)) as container:
+        stream = container.streams.video[0]
+        first = next(container.decode(stream), None)
+        shape, aspect = (stream.width, stream.height)[:: -1 if quarters(first) % 2 else 1], pixel_aspect(stream)
+    layout = "top_bottom" if shape[0] < _TALL * shape[1] else "side_by_side"
+    if first and shape[0] * aspect < _WIDE * shape[1] and layout == "side_by_side":
+        small = cv2.resize(np.rot90(first.to_ndarray(format="gray"), quarters(first)), (64, 64), interpolation=cv2.INTER_AREA)
+        alike = {axis: np.corrcoef(*(half.ravel() for half in np.split(small, 2, axis=axis)))[0, 1] for axis in (0, 1)}
+        layout, aspect = ("top_bottom", 0.5) if alike[0] > alike[1] else ("side_by_side", 2.0)
+    return {"layout": layout} | ({} if aspect == 1 else {"pixel_aspect": aspect})
 
 
 def _film_times(film: Path, tables: dict[str, tuple]) -> dict:

@@ -41,6 +41,7 @@ class Video(_Section):
     exchanged: bool = False
     rotate_left: Literal[0, 90, 180, 270] = 0  # degrees clockwise, after the exchange
     rotate_right: Literal[0, 90, 180, 270] = 0
+    pixel_aspect: Annotated[float, Field(ge=0.2, le=5)] = 1.0  # width over height in the files; pixels are made square
     times: Literal["container", "names", "table", "fps"] = "container"
     table: Table | None = None
     name_unit: Literal["s", "ms", "us", "ns"] = "ns"
@@ -156,8 +157,9 @@ class Mapping(_Section):
     def model_post_init(self, _: object) -> None:
         ours, columns = set(self.landmarks), self.robot.landmarks
         labels = self.labels.names if self.labels else {}
-        if self.labels and (self.video.rotate_left or self.video.rotate_right):
-            raise ValueError("labels of images that are to be turned are not read: leave labels out, and label the recording")
+        if self.labels and (self.video.rotate_left or self.video.rotate_right or self.video.pixel_aspect != 1):
+            cure = "leave labels out, and label the recording"
+            raise ValueError(f"labels of images that are to be turned are not read, nor if pixel_aspect is not 1: {cure}")
         if len(ours) < len(self.landmarks):
             raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
         if unknown := sorted({*(columns or {}), *labels, *self.tool.landmarks_mm, *self.tool.pivot_s} - ours):

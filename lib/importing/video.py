@@ -10,6 +10,7 @@ from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
 
 import av
+import cv2
 import numpy as np
 from PIL import Image
 from scipy.spatial import KDTree
@@ -23,6 +24,7 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wm
 _STEP_S = 1e-4, 60.0  # plausible median step of frames; outside this range the unit of time must be wrong
 _DEPTH_SAMPLES = 12  # number of frames in which the brightest value is searched
 _LOST = 1.5  # a step between frames, in usual steps, above which a frame is missing between them
+_SQUARE = 0.02  # largest difference of a pixel's width over height from 1 that does not matter
 _DECIMAL = re.compile(r"(?<![\d.])(\d+\.|\d{10}[_-])(\d{1,9})$")  # over 9 digits after a point are a time themselves
 
 
@@ -70,7 +72,7 @@ class _Images:
             if one == other:
                 raise ValueError(f"{later}: has the same number as {path.name}. Narrow the pattern to one camera.")
         self.stamps, exif = None, _orientation(self.files[0])
-        self.turned = f"has the EXIF orientation {exif}" if exif > 1 else ""
+        self.turned, self.aspect = f"has the EXIF orientation {exif}" if exif > 1 else "", 1.0
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
         counted &= len(set(map(int, seconds))) < 2
         self.numbers = {path.stem: n for n, path in enumerate(self.files)}
@@ -98,6 +100,11 @@ def quarters(frame: av.VideoFrame | None) -> int:
     return round(frame.rotation / 90) if frame else 0
 
 
+def pixel_aspect(stream: av.VideoStream) -> float:
+    """Width of a pixel over its height, as the video states it; 1 if it states none."""
+    return float(stream.sample_aspect_ratio or 1)
+
+
 class _Film:
     """A video file, decoded from its start; times are those of its container."""
 
@@ -112,6 +119,7 @@ class _Film:
             end_s = (container.duration or 0) / av.time_base if timed else 0.0
             listed = len(stream.index_entries) if "mp4" in kinds else stream.frames  # .mp4 lists less if it is trimmed
             count = listed if stream.frames else len(packets)
+            self.aspect = pixel_aspect(stream)
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
         times = [own for discarded, *own in packets if not discarded]  # a trimmed .mp4 still holds what it does not show
         # .avi has only times of decoding (dts), which frames do not carry.
@@ -198,6 +206,9 @@ class StereoSource:
                 images = np.split(images[0], 2, axis=axis)
             turns = self.video.rotate_left, self.video.rotate_right
             images = images[::-1] if self.video.exchanged else images
+            if (aspect := self.video.pixel_aspect) != 1:
+                fx, fy = max(aspect, 1.0), max(1 / aspect, 1.0)
+                images = [cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_CUBIC) for image in images]
             left, right = (np.rot90(image, -turn // 90) for image, turn in zip(images, turns, strict=True))
             if left.shape != right.shape and not (any(turns) and sorted(left.shape) == sorted(right.shape)):
                 what = f"left and right frames differ in size ({' and '.join(sizes)})"
@@ -215,6 +226,11 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     if len(reels) == 2 and (shared := sorted({*reels[0].files} & {*reels[1].files})):
         raise ValueError(f"{shared[0]}: video.left and video.right both take it. Name each camera's own files.")
     notes = [f"{reel.files[0].name} {reel.turned}; its camera's images were turned so." for reel in reels if reel.turned]
+    notes += [
+        f"{reel.files[0].name} states pixels {reel.aspect:.4g} times as wide as high: if circles look like ellipses in the "
+        f"recording, import again with video.pixel_aspect = {reel.aspect:.4g}."
+        for reel in reels if abs(reel.aspect - 1) > _SQUARE and video.pixel_aspect == 1
+    ]  # fmt: skip
     times = [_times(folder, video, reel, place, notes) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")

@@ -263,7 +263,8 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
     text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within a few per cent."
-    yield "aspect", aspect, text, f"If the images were resized to another shape, undo that. Otherwise: {cure}", name
+    undo = f"undo that, or import with {np.exp(np.log(zooms[:, 1] / zooms[:, 0]).mean()):.2f} times the present pixel_aspect"
+    yield "aspect", aspect, text, f"If the images were resized to another shape, {undo}. Otherwise: {cure}", name
     if c.rig is None:
         return
     ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))

@@ -76,13 +76,16 @@ def posed(source: Shipped) -> tuple[list[RigidTransform], np.ndarray, np.ndarray
 
 
 def video(
-    path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p", gop: int = 12
-) -> None:
+    path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p", gop: int = 12,
+    aspect: Fraction | None = None,
+) -> None:  # fmt: skip
     """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w), with a key frame in each `gop` frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
         stream.height, stream.width, stream.pix_fmt, stream.gop_size = *images.shape[1:3], pix_fmt, gop
         stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
+        if aspect:  # width of a pixel over its height
+            stream.codec_context.sample_aspect_ratio = aspect
         stream.options = {"crf": "15", "preset": "ultrafast"} if codec == "libx264" else {}
         for image, time in zip(images, time_s, strict=True):
             frame = av.VideoFrame.from_ndarray(image, format={"uint16": "gray16le"}.get(str(image.dtype), "rgb24"))

@@ -3,8 +3,10 @@
 import struct
 import warnings
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -74,6 +76,41 @@ def test_a_video_that_is_shown_mirrored_is_refused_and_a_turned_pair_is_guessed_
     data[at : at + 24] = struct.pack(">6i", 0, 65536, 0, -65536, 0, 0)
     (tmp_path / "stereo.mp4").write_bytes(data)
     assert 'layout = "top_bottom"' in guess_mapping(tmp_path)
+
+
+@pytest.mark.parametrize(("layout", "axis", "aspect"), [("side_by_side", 1, 2.0), ("top_bottom", 0, 0.5)])
+def test_views_that_are_squeezed_into_one_frame_are_guessed_and_stretched(layout, axis, aspect, few, tmp_path):
+    folder, mapping = source_of(tmp_path, few, foreign.robot_csv)
+    height, width = few.frames.shape[2:4]
+    size = (width // 2, height) if axis == 1 else (width, height // 2)
+    packed = [
+        np.concatenate([cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in pair], axis=axis)
+        for pair in few.frames
+    ]
+    foreign.video(folder / "stereo.mp4", np.array(packed), few.time_s)
+    guess = guess_mapping(folder)
+    assert f'layout = "{layout}"' in guess and f"pixel_aspect = {aspect}" in guess
+    given = f'[video]\nlayout = "{layout}"\nfile = "stereo.mp4"\npixel_aspect = {aspect}\n'
+    mapping.write_text(mapping.read_text("utf-8") + given, "utf-8")
+    did, recording = quietly(folder, mapping, tmp_path / "eye")
+    for side, image in enumerate((recording.frames[3].left, recording.frames[3].right)):
+        assert image.shape == few.frames[3, side].shape
+        off = np.abs(image.astype(float) - few.frames[3, side]).mean()
+        assert off < 6 and off < 0.5 * np.abs(np.roll(image, 4, axis=1).astype(float) - few.frames[3, side]).mean()
+    assert any("square" in line for line in did)
+    with pytest.raises(ValueError, match="labels .* are not read"):
+        mapping.write_text(f"{mapping.read_text('utf-8')}[labels]\nkind = 'coco'\nfile = 'labels.json'\n", "utf-8")
+        read_mapping(mapping)
+
+
+def test_pixels_that_a_video_states_as_not_square_are_told(few, tmp_path):
+    folder, mapping = source_of(tmp_path, few, foreign.robot_csv)
+    for side, name in enumerate(("left.mp4", "right.mp4")):
+        foreign.video(folder / name, few.frames[:, side], few.time_s, aspect=Fraction(4, 3))
+    mapping.write_text(mapping.read_text("utf-8") + TWO, "utf-8")
+    did, recording = quietly(folder, mapping, tmp_path / "eye")
+    assert any("left.mp4 states pixels 1.333 times as wide as high" in line for line in did)
+    assert recording.frames[0].left.shape == few.frames[0, 0].shape
 
 
 @pytest.mark.parametrize(("orientation", "shown"), [

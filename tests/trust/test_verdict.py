@@ -66,6 +66,14 @@ def test_an_image_that_is_turned_against_the_other_is_named():
     assert "turned_image" not in names(mirrored) and "mirrored" in names(mirrored)
 
 
+def test_images_that_were_resized_to_another_shape_are_told_with_the_factor_that_undoes_it():
+    data = made(40, 0)
+    squeezed = replace(data, u_left=data.u_left * [0.5, 1.0], u_right=data.u_right * [0.5, 1.0])
+    calibration = calibrate(squeezed, image_size_px=(960, 1080))
+    (reason,) = (r for r in judge(squeezed, calibration).reasons if "between x and y" in r.text)
+    assert reason.level == LEVELS[2] and "2.00 times the present pixel_aspect" in reason.cure
+
+
 @pytest.mark.parametrize("n", [6, 8, 12, 40])
 def test_clean_data_of_any_size_are_never_red(n):
     levels = [level for seed in range(15) for level in names(made(n, seed)).values()]
