@@ -166,8 +166,8 @@ def judge(
         by_log = [doubt.cure for doubt in doubts if doubt.name in LOG_DOUBTS and best.name in _BY_LOG]
         found += _reason("diagnosis", best.explained, text, (by_log or [best.cure])[0], best.name)
     if calibration is None:
-        errs = health is not None and health.unhealthy > LIMITS["health"][0]  # wrong detections may agree with each other
-        competing = "no_consensus" if errs else "refused"
+        errs = (best and best.name in OF_DETECTOR) or (health and health.unhealthy > LIMITS["health"][0])
+        competing = "no_consensus" if errs else "refused"  # wrong detections may agree with each other
         kinds = {NoDetectionError: "no_detection", CompetingCamerasError: competing, NoConsensusError: "no_consensus"}
         name = next((name for kind, name in kinds.items() if isinstance(error, kind)), "refused")
         cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."

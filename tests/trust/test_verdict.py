@@ -194,6 +194,9 @@ def test_where_the_detector_errs_competing_cameras_may_be_its_errors():
     assert alone.cure == "Correct that, then check again."
     reasons = judge(made(60), None, error=error, health=few_bad).reasons
     assert [reason.name for reason in reasons] == ["no_consensus", "detector_unfit"] and "lib adapt" in reasons[0].cure
+    cause = Hypothesis("detector_unfit", "24 % of them lie elsewhere.", "Let it be taught.", 24.0, 0.0, "%", 0.24, 32.2)
+    reasons = judge(made(60), None, error=error, diagnosis=Diagnosis((cause,))).reasons
+    assert [reason.name for reason in reasons] == ["no_consensus", "detector_unfit"]
 
 
 def test_a_refusal_does_not_contradict_the_diagnosis():
