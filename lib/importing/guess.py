@@ -18,7 +18,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import separator_of, text_of, topics_of, uncommented
-from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, pixel_aspect, quarters
+from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, quarters, stated
 from lib.recordings.tables import read_toml
 
 _TALL, _WIDE = 1.1, 1.95  # width over height of a film with both views: below, on top of each other; above, side by side
@@ -72,8 +72,7 @@ def guess_mapping(source: str | Path) -> str:
 def _video(folder: Path, paths: dict[str, Path], tables: dict[str, tuple]) -> dict:
     films, images = ([n for n, path in paths.items() if path.suffix.lower() in kind] for kind in (VIDEOS, IMAGES))
     if len(films) == 1:
-        film = {"file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
-        return _layout(folder / films[0]) | film
+        return _layout(folder / films[0]) | {"file": films[0], **_film_times(folder / films[0], tables), "exchanged": False}
     kinds = Counter((Path(name).parent / f"*{Path(name).suffix}").as_posix() for name in images)
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
     if not names:
@@ -98,13 +97,13 @@ def _layout(film: Path) -> dict:
     with av.open(str(film)) as container:
         stream = container.streams.video[0]
         first = next(container.decode(stream), None)
-        shape, aspect = (stream.width, stream.height)[:: -1 if quarters(first) % 2 else 1], pixel_aspect(stream)
+        shape, keys = (stream.width, stream.height)[:: -1 if quarters(first) % 2 else 1], stated(stream, first)
     layout = "top_bottom" if shape[0] < _TALL * shape[1] else "side_by_side"
-    if first and shape[0] * aspect < _WIDE * shape[1] and layout == "side_by_side":
+    if first and shape[0] * keys.get("pixel_aspect", 1) < _WIDE * shape[1] and layout == "side_by_side":
         small = cv2.resize(np.rot90(first.to_ndarray(format="gray"), quarters(first)), (64, 64), interpolation=cv2.INTER_AREA)
         alike = {axis: np.corrcoef(*(half.ravel() for half in np.split(small, 2, axis=axis)))[0, 1] for axis in (0, 1)}
-        layout, aspect = ("top_bottom", 0.5) if alike[0] > alike[1] else ("side_by_side", 2.0)
-    return {"layout": layout} | ({} if aspect == 1 else {"pixel_aspect": aspect})
+        layout, keys["pixel_aspect"] = ("top_bottom", 0.5) if alike[0] > alike[1] else ("side_by_side", 2.0)
+    return {"layout": layout, **keys}
 
 
 def _film_times(film: Path, tables: dict[str, tuple]) -> dict:

@@ -41,6 +41,7 @@ class Video(_Section):
     exchanged: bool = False
     rotate_left: Literal[0, 90, 180, 270] = 0  # degrees clockwise, after the exchange
     rotate_right: Literal[0, 90, 180, 270] = 0
+    deinterlace: bool = False
     pixel_aspect: Annotated[float, Field(ge=0.2, le=5)] = 1.0  # width over height in the files; pixels are made square
     times: Literal["container", "names", "table", "fps"] = "container"
     table: Table | None = None

@@ -72,7 +72,7 @@ class _Images:
             if one == other:
                 raise ValueError(f"{later}: has the same number as {path.name}. Narrow the pattern to one camera.")
         self.stamps, exif = None, _orientation(self.files[0])
-        self.turned, self.aspect = f"has the EXIF orientation {exif}" if exif > 1 else "", 1.0
+        self.turned, self.stated = f"has the EXIF orientation {exif}" if exif > 1 else "", {}
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
         counted &= len(set(map(int, seconds))) < 2
         self.numbers = {path.stem: n for n, path in enumerate(self.files)}
@@ -100,9 +100,23 @@ def quarters(frame: av.VideoFrame | None) -> int:
     return round(frame.rotation / 90) if frame else 0
 
 
-def pixel_aspect(stream: av.VideoStream) -> float:
-    """Width of a pixel over its height, as the video states it; 1 if it states none."""
-    return float(stream.sample_aspect_ratio or 1)
+def stated(stream: av.VideoStream, first: av.VideoFrame | None) -> dict[str, float | bool]:
+    """Keys of a mapping for unusual pixels and rows that a video states; `first` is its first frame."""
+    aspect = round(float(stream.sample_aspect_ratio or 1), 4)
+    keys = {"pixel_aspect": aspect} if abs(aspect - 1) > _SQUARE else {}
+    return keys | ({"deinterlace": True} if first and first.interlaced_frame else {})
+
+
+def deinterlaced(image: np.ndarray) -> np.ndarray:
+    """The even rows of an image (h, w, 3) uint8, which are of one instant; each odd row is the mean of its neighbours.
+
+    >>> deinterlaced(np.uint8([[0], [9], [2], [9]])[..., None])[:, 0, 0]
+    array([0, 1, 2, 2], dtype=uint8)
+    """
+    even, found = image[::2], image.copy()
+    below = np.concatenate([even[1:], even[-1:]])[: len(image) // 2]
+    found[1::2] = (even[: len(below)].astype(np.uint16) + below + 1) // 2
+    return found
 
 
 class _Film:
@@ -119,7 +133,7 @@ class _Film:
             end_s = (container.duration or 0) / av.time_base if timed else 0.0
             listed = len(stream.index_entries) if "mp4" in kinds else stream.frames  # .mp4 lists less if it is trimmed
             count = listed if stream.frames else len(packets)
-            self.aspect = pixel_aspect(stream)
+            self.stated = stated(stream, first := next(self._decoded(), None))
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
         times = [own for discarded, *own in packets if not discarded]  # a trimmed .mp4 still holds what it does not show
         # .avi has only times of decoding (dts), which frames do not carry.
@@ -128,7 +142,6 @@ class _Film:
         whole = len(packets) == count and 0 < len(ticks) == len(times)
         if not whole or (end_s and float(base) * (ticks[-1] + 2.5 * (ticks[-1] - ticks[0]) / len(ticks)) + 0.2 < end_s):
             raise ValueError(f"{path}: the video is cut off: {len(packets)} of {count} frames, {end_s:.1f} s. Copy it again.")
-        first = next(self._decoded(), None)
         self._quarters = quarters(first)
         way = "" if self._quarters % 2 == 0 else " anticlockwise" if self._quarters > 0 else " clockwise"
         self.turned = f"states that it is shown turned by {90 * abs(self._quarters)} degrees{way}" if self._quarters else ""
@@ -199,6 +212,7 @@ class StereoSource:
             for place, size, first in zip(places, sizes, usual, strict=True):
                 if size != first:
                     raise ValueError(f"{place}: it has {size}, but the frames before it {first}. Export all alike.")
+            images = [deinterlaced(image) for image in images] if self.video.deinterlace else images
             if self.video.layout != "two":
                 axis = 1 if self.video.layout == "side_by_side" else 0
                 if images[0].shape[axis] % 2:
@@ -226,11 +240,13 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     if len(reels) == 2 and (shared := sorted({*reels[0].files} & {*reels[1].files})):
         raise ValueError(f"{shared[0]}: video.left and video.right both take it. Name each camera's own files.")
     notes = [f"{reel.files[0].name} {reel.turned}; its camera's images were turned so." for reel in reels if reel.turned]
-    notes += [
-        f"{reel.files[0].name} states pixels {reel.aspect:.4g} times as wide as high: if circles look like ellipses in the "
-        f"recording, import again with video.pixel_aspect = {reel.aspect:.4g}."
-        for reel in reels if abs(reel.aspect - 1) > _SQUARE and video.pixel_aspect == 1
-    ]  # fmt: skip
+    for reel in reels:
+        if (aspect := reel.stated.get("pixel_aspect", 1)) != 1 and video.pixel_aspect == 1:
+            what = f"states pixels {aspect:g} times as wide as high: if circles look like ellipses in the recording"
+            notes.append(f"{reel.files[0].name} {what}, import again with video.pixel_aspect = {aspect:g}.")
+        if "deinterlace" in reel.stated and not video.deinterlace:
+            what = "states that it is interlaced: if a moving tool has edges like combs"
+            notes.append(f"{reel.files[0].name} {what}, import again with video.deinterlace = true.")
     times = [_times(folder, video, reel, place, notes) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), _STEP_S, "name_unit" if video.times == "names" else "time_unit")

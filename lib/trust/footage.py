@@ -171,7 +171,7 @@ def _interlaced(best: Hypothesis, recording: Recording, data: Correspondences) -
     if not ratios or np.median(ratios) < _COMBED:
         return None
     text = "The images are interlaced: their odd rows show the tool at another instant than their even rows."
-    cure = "Deinterlace the videos: keep the even rows, fill in the odd ones from them (ffmpeg's filter yadif), import again."
+    cure = "Import again with video.deinterlace = true in the mapping: it keeps the even rows, and fills in the odd ones."
     return replace(best, name="interlaced", text=text, cure=cure, value=float(np.median(ratios)), sd=0.0, unit="times")
 
 

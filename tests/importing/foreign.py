@@ -77,7 +77,7 @@ def posed(source: Shipped) -> tuple[list[RigidTransform], np.ndarray, np.ndarray
 
 def video(
     path: Path, images: np.ndarray, time_s: np.ndarray, codec: str = "libx264", pix_fmt: str = "yuv420p", gop: int = 12,
-    aspect: Fraction | None = None,
+    aspect: Fraction | None = None, interlaced: bool = False,
 ) -> None:  # fmt: skip
     """A video whose frames carry these times, of images (n, h, w, 3) or (n, h, w), with a key frame in each `gop` frames."""
     with av.open(str(path), "w") as container:
@@ -87,6 +87,7 @@ def video(
         if aspect:  # width of a pixel over its height
             stream.codec_context.sample_aspect_ratio = aspect
         stream.options = {"crf": "15", "preset": "ultrafast"} if codec == "libx264" else {}
+        stream.options = stream.options | ({"x264-params": "tff=1"} if interlaced else {})
         for image, time in zip(images, time_s, strict=True):
             frame = av.VideoFrame.from_ndarray(image, format={"uint16": "gray16le"}.get(str(image.dtype), "rgb24"))
             frame.pts, frame.time_base = round(time * 90000), Fraction(1, 90000)

@@ -103,13 +103,40 @@ def test_views_that_are_squeezed_into_one_frame_are_guessed_and_stretched(layout
         read_mapping(mapping)
 
 
+@pytest.mark.parametrize("layout", ["two", "side_by_side"])
+def test_an_interlaced_video_is_told_guessed_and_filled_in(layout, few, tmp_path):
+    """Its odd rows show everything elsewhere."""
+    folder, mapping = source_of(tmp_path, few, foreign.robot_csv)
+    shown = few.frames[:, :, : few.frames.shape[2] // 4 * 4]  # interlaced H.264 needs it
+    frames = shown.copy()
+    frames[:, :, 1::2] = np.roll(shown, 40, axis=3)[:, :, 1::2]
+    if layout == "two":
+        for side, name in enumerate(("left.mp4", "right.mp4")):
+            foreign.video(folder / name, frames[:, side], few.time_s, interlaced=True)
+        text = TWO
+    else:
+        beside = np.concatenate([frames[:, 0], frames[:, 1]], axis=2)
+        foreign.video(folder / "stereo.mp4", beside, few.time_s, interlaced=True)
+        assert "deinterlace = true" in guess_mapping(folder)
+        text = '[video]\nlayout = "side_by_side"\nfile = "stereo.mp4"\n'
+    given = mapping.read_text("utf-8")
+    off = []
+    for more in ("", "deinterlace = true\n"):
+        mapping.write_text(given + text + more, "utf-8")
+        did, recording = quietly(folder, mapping, tmp_path / "eye")
+        off.append(np.abs(recording.frames[3].left.astype(float) - shown[3, 0]).mean(axis=(1, 2)))
+        assert any("is interlaced: " in line for line in did) == (not more)
+        assert any("even rows were kept" in line for line in did) == bool(more)
+    assert off[1][::2].mean() < 1.2 * off[0][::2].mean() and off[1][1::2].mean() < 0.6 * off[0][1::2].mean()
+
+
 def test_pixels_that_a_video_states_as_not_square_are_told(few, tmp_path):
     folder, mapping = source_of(tmp_path, few, foreign.robot_csv)
     for side, name in enumerate(("left.mp4", "right.mp4")):
         foreign.video(folder / name, few.frames[:, side], few.time_s, aspect=Fraction(4, 3))
     mapping.write_text(mapping.read_text("utf-8") + TWO, "utf-8")
     did, recording = quietly(folder, mapping, tmp_path / "eye")
-    assert any("left.mp4 states pixels 1.333 times as wide as high" in line for line in did)
+    assert any("left.mp4 states pixels 1.3333 times as wide as high" in line for line in did)
     assert recording.frames[0].left.shape == few.frames[0, 0].shape
 
 
