@@ -101,7 +101,8 @@ def _layout(film: Path) -> dict:
     layout = "top_bottom" if shape[0] < _TALL * shape[1] else "side_by_side"
     if first and shape[0] * keys.get("pixel_aspect", 1) < _WIDE * shape[1] and layout == "side_by_side":
         small = cv2.resize(np.rot90(first.to_ndarray(format="gray"), quarters(first)), (64, 64), interpolation=cv2.INTER_AREA)
-        alike = {axis: np.corrcoef(*(half.ravel() for half in np.split(small, 2, axis=axis)))[0, 1] for axis in (0, 1)}
+        with np.errstate(invalid="ignore"):  # of a black frame
+            alike = [np.corrcoef(*(half.ravel() for half in np.split(small, 2, axis=axis)))[0, 1] for axis in (0, 1)]
         layout, keys["pixel_aspect"] = ("top_bottom", 0.5) if alike[0] > alike[1] else ("side_by_side", 2.0)
     return {"layout": layout, **keys}
 

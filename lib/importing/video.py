@@ -102,7 +102,7 @@ def quarters(frame: av.VideoFrame | None) -> int:
 
 def stated(stream: av.VideoStream, first: av.VideoFrame | None) -> dict[str, float | bool]:
     """Keys of a mapping for unusual pixels and rows that a video states; `first` is its first frame."""
-    aspect = round(float(stream.sample_aspect_ratio or 1), 4)
+    aspect = round(float(stream.sample_aspect_ratio or 1) ** (-1 if quarters(first) % 2 else 1), 4)
     keys = {"pixel_aspect": aspect} if abs(aspect - 1) > _SQUARE else {}
     return keys | ({"deinterlace": True} if first and first.interlaced_frame else {})
 
