@@ -9,6 +9,7 @@ import os
 import platform
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import distributions
@@ -18,6 +19,7 @@ from typing import NamedTuple
 
 import nbformat
 from nbclient.exceptions import CellTimeoutError, DeadKernelError
+from traitlets.config import Config
 
 from lib import paths
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
@@ -30,6 +32,7 @@ _GRID = re.compile(r";\s*grid:(.*)$")
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
 #: Tag of a cell during which no other notebook of the run may compute: it measures time, or trains for a limited time.
 ALONE = "alone"
+_LONGEST_PATH = 80  # of a folder with sockets, whose paths may have 103 characters
 _NO_START = "Kernel died before replying"  # in the error of a kernel that ended before its first cell
 #: Environment variables for the kernels.
 _KERNEL_ENVIRONMENT = {
@@ -228,6 +231,7 @@ def execute(
                 start_timeout=600,  # a kernel may start slowly on a busy machine
                 on_cell_start=on_cell_start,  # this and the next are passed to nbclient
                 extra_arguments=["--IPKernelApp.log_level=50"],  # suppresses a warning of unencrypted TCP on every start
+                config=_sockets(folder),
             )  # fmt: skip
         except PapermillExecutionError as error:  # `report.stop` does not raise it
             return Failure("error", running, f"{error.ename}: {strip_color(error.evalue)}")
@@ -242,9 +246,17 @@ def execute(
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # the returned failure contains its messages
-    failure = attempt()
-    # Of kernels that start at once, one may find its ports taken by another.
-    return attempt() if failure and not running and _NO_START in failure.message else failure
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        failure = attempt()
+        # Of kernels that start at once, one may find its ports taken by another.
+        return attempt() if failure and not running and _NO_START in failure.message else failure
+
+
+def _sockets(folder: str) -> Config:
+    """Configuration of a kernel that is reached by files in a folder instead of ports, where the system can."""
+    if os.name != "posix" or len(folder) > _LONGEST_PATH:
+        return Config()
+    return Config(KernelManager={"transport": "ipc", "connection_file": f"{folder}/kernel.json"})
 
 
 class Stated(NamedTuple):

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import zipfile
@@ -220,6 +221,22 @@ def test_a_site_is_a_copy_that_needs_no_server_of_ours(finished, tmp_path, monke
     monkeypatch.setattr(command.paths, "RUNS", tmp_path / "none")
     assert main_site(["--out", str(tmp_path / "other")]) == 2 and not (tmp_path / "other").exists()
     assert "`python3 -m lib run` makes one" in capsys.readouterr().err
+
+
+def test_a_kernel_takes_no_ports_which_another_one_could_take(tmp_path, write_notebook, monkeypatch):
+    """Where the system has sockets that are files, in a folder whose path leaves room for their names."""
+    ask = "from ipykernel.connect import get_connection_info\nprint(get_connection_info(unpack=True)['transport'])"
+    book, output = write_notebook(tmp_path, "01_ask", ask), tmp_path / "executed.ipynb"
+
+    def transport():
+        assert execute(book, output, {}) is None
+        return nbformat.read(output, as_version=4).cells[-1].outputs[0].text.strip()
+
+    assert transport() == ("ipc" if os.name == "posix" else "tcp")
+    long = tmp_path / ("long" * 30)
+    long.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    assert transport() == "tcp" and not list(long.iterdir())
 
 
 @pytest.fixture
