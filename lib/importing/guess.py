@@ -17,7 +17,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
-from lib.importing.logs import separator_of, text_of, topics_of, uncommented
+from lib.importing.logs import JSON, json_rows, separator_of, text_of, topics_of, uncommented
 from lib.importing.video import IMAGES, VIDEOS, decimals, last_number, quarters, stated
 from lib.recordings.tables import read_toml
 
@@ -30,6 +30,7 @@ _NO_POINT = re.compile(r"(?i)(^|[ _.\-])([vwf]|vel\w*|speed|acc\w*|force|torque)
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
 _NUMBERED = re.compile(r"^(.*?)[ _.\[(]*\d[ _.,\[\]()]*\d?[\])]?$")
 _CURE = "Convert the robot's log to CSV: one row for each time, and three columns for each landmark"
+_TABLES = ".csv", ".tsv", ".txt", *JSON
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
 
 
@@ -39,9 +40,10 @@ def guess_mapping(source: str | Path) -> str:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
     paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file() and p.name[0] != "."}
-    labels = {n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"} or p.stem.startswith("CollectedData")}
+    deeplabcut = {n: p for n, p in paths.items() if p.stem.startswith("CollectedData")}
+    labels = _labels({n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"}} | deeplabcut)
     tables, refused = {}, None
-    for name in (n for n, p in paths.items() if p.suffix.lower() in (".csv", ".tsv", ".txt") and n not in labels):
+    for name in (n for n, p in paths.items() if p.suffix.lower() in _TABLES and n not in {*deeplabcut, labels.get("file")}):
         try:
             tables[name] = _table(paths[name])
         except (ValueError, csv.Error) as error:  # it may be notes in another encoding
@@ -54,7 +56,7 @@ def guess_mapping(source: str | Path) -> str:
     guess = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
     video = _video(folder, paths, {name: table for name, table in tables.items() if name != robot["file"]})
     guess |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot}
-    guess |= {"tool": {"estimate": True} if estimate else to_measure, "labels": _labels(labels)}
+    guess |= {"tool": {"estimate": True} if estimate else to_measure, "labels": labels}
     comments = read_toml(Path(__file__).with_name("comments.toml"))
     if "pose" in robot and "rotation" not in robot["pose"]:
         comments["robot.pose"] = comments["robot.rotation"]
@@ -134,11 +136,14 @@ def _frame_times(tables: dict[str, tuple], frames: int) -> dict:
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark of a table, and the cells of each column."""
-    lines = [line for line in uncommented(text_of(path)[0]) if line.strip()] or [","]
-    separator = separator_of(lines[0])
-    if separator == " " and lines[0].count(" ") != lines[-1].count(" "):  # the name of a single column
-        separator = ","
-    header, *rows = ([cell.strip() for cell in cells] for cells in csv.reader(lines, delimiter=separator))
+    if path.suffix.lower() in JSON:
+        separator, (header, *rows) = ",", (cells for _, cells in json_rows(path))
+    else:
+        lines = [line for line in uncommented(text_of(path)[0]) if line.strip()] or [","]
+        separator = separator_of(lines[0])
+        if separator == " " and lines[0].count(" ") != lines[-1].count(" "):  # the name of a single column
+            separator = ","
+        header, *rows = ([cell.strip() for cell in cells] for cells in csv.reader(lines, delimiter=separator))
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
     columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}
     return {"separator": separator, "decimal": decimal}, columns
@@ -173,7 +178,7 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
         return _bag(folder, bags[0].rpartition("/")[0] if (folder / bags[0]).with_name("metadata.yaml").exists() else bags[0])
     if not tables:
         others = [name for name, path in paths.items() if path.suffix.lower() not in (*VIDEOS, *IMAGES)]
-        what = "no log of a robot in it: no ROS bag, and no table (.csv, .tsv, .txt) with three columns of numbers"
+        what = f"no log of a robot in it: no ROS bag, and no table ({', '.join(_TABLES)}) with three columns of numbers"
         raise refused or FileNotFoundError(f"{folder}: {what}. It has {', '.join(others) or 'no other files'}. {_CURE}.")
     name = max(tables, key=lambda name: paths[name].stat().st_size)
     dialect, columns = tables[name]

@@ -1,5 +1,6 @@
-"""Reads tables of other programs (CSV of any dialect, ROS bags) with exact times, and the robot's log in mm and s."""
+"""Reads tables of other programs (CSV, JSON, ROS bags) with exact times, and the robot's log in mm and s."""
 
+import json
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,6 +24,8 @@ _STEP_S = 2e-5, 3.0  # plausible median step of a robot's samples; outside this 
 _ROUNDED = 0.25  # share of the rows that repeat the time before, from which on they count as rounded
 _DAY_S = 86400
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
+JSON = ".json", ".jsonl", ".ndjson"
+_STAMPS = {"sec", "secs"}, {"nsec", "nsecs", "nanosec", "nanosecs"}  # keys of a time stamp of ROS
 _FAR = 10.0  # a value that recurs in all coordinates is no position if it is farther off than so many ranges of the others
 
 
@@ -112,26 +115,56 @@ def text_of(path: Path) -> tuple[str, bool]:
         raise refused from None
 
 
+def json_rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield place and cells of header and rows of JSON: one object a line, or one list of objects.
+
+    Columns are named by their path, such as "pose.position.x" or "joints[0]"; a time stamp of ROS is one column.
+    """
+    text = decoded(path)
+    parse = partial(json.loads, parse_float=str, parse_int=str)  # keeps all digits of a time
+    try:
+        if text.lstrip()[:1] == "[":
+            entries = {f"{path}, entry {n}": entry for n, entry in enumerate(parse(text), start=1)}
+        else:
+            lines = enumerate(text.splitlines(), start=1)
+            entries = {f"{path}, line {n}": parse(line) for n, line in lines if line.strip()}
+        rows = {place: dict(_leaves(entry.items())) for place, entry in entries.items()}
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: not JSON with one object a line, or a list of objects ({error}).") from None
+    header = list(dict.fromkeys(name for row in rows.values() for name in row))
+    yield str(path), header
+    for place, row in rows.items():
+        yield place, [row.get(name, "") for name in header]
+
+
+def _leaves(items: Iterable[tuple[str, object]]) -> Iterator[tuple[str, str]]:
+    """Path and text of each value inside an object."""
+    for name, value in items:
+        keys = sorted(value, reverse=True) if isinstance(value, dict) else []  # "secs" goes before "nsecs"
+        if len(keys) == 2 and all(key in kind for key, kind in zip(keys, _STAMPS, strict=True)):
+            yield name, f"{value[keys[0]]}.{value[keys[1]]:>09}"
+        elif isinstance(value, dict):
+            yield from _leaves((f"{name}.{key}", inner) for key, inner in value.items())
+        elif isinstance(value, list):
+            yield from _leaves((f"{name}[{i}]", inner) for i, inner in enumerate(value))
+        else:
+            yield name, "" if value is None else str(value)
+
+
 def read_columns(
     path: Path, table: Table, names: Iterable[str], notes: list[str]
 ) -> tuple[list[Decimal], dict[str, np.ndarray], list[str]]:
-    """Read exact times, the named columns (m,) with NaN for empty cells, and each row's place; from a CSV or ROS bag.
+    """Read exact times, the named columns (m,) with NaN for empty cells, and each row's place; from CSV, JSON or a ROS bag.
 
     `notes` gets a sentence about another encoding than UTF-8, and about a last line that is cut, which is left out.
     """
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
-    if path.suffix.lower() in (".json", ".jsonl", ".npy", ".npz", ".mat", ".h5", ".parquet", ".xls", ".xlsx"):
-        raise ValueError(f"{path}: only CSV tables and ROS bags are read here. Convert it to CSV, one row for each time.")
+    if path.suffix.lower() in (".npy", ".npz", ".mat", ".h5", ".parquet", ".xls", ".xlsx"):
+        what = "only CSV tables, JSON with one object a line and ROS bags are read here"
+        raise ValueError(f"{path}: {what}. Convert it to CSV, one row for each time.")
     wanted = [table.time, *names]
-    text, by_excel = text_of(path)
-    notes += [f"{path.name} is not UTF-8 and was read as Windows-1252."] * by_excel
-    lines = uncommented(text, table.separator)
-    cells = [line.count(table.separator) + 1 for line in lines if line.strip()]
-    if text[-1:] not in "\r\n" and lines[-1].strip() and cells[-1] < min(cells[0], cells[-2:][0]):
-        notes.append(f"The last line of {path.name} is cut ({cells[-1]} of {cells[0]} cells) and was left out.")
-        lines.pop()
-    rows = rows_of(path, "\n".join(lines), table.separator)
+    rows = json_rows(path) if path.suffix.lower() in JSON else _csv_rows(path, table.separator, notes)
     place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:
@@ -152,6 +185,17 @@ def read_columns(
         days = accumulate((now < before - _DAY_S // 2 for before, now in pairwise(time)), initial=0)
         time = [t + _DAY_S * day for t, day in zip(time, days, strict=True)]
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True)), places
+
+
+def _csv_rows(path: Path, separator: str, notes: list[str]) -> Iterator[tuple[str, list[str]]]:
+    text, by_excel = text_of(path)
+    notes += [f"{path.name} is not UTF-8 and was read as Windows-1252."] * by_excel
+    lines = uncommented(text, separator)
+    cells = [line.count(separator) + 1 for line in lines if line.strip()]
+    if text[-1:] not in "\r\n" and lines[-1].strip() and cells[-1] < min(cells[0], cells[-2:][0]):
+        notes.append(f"The last line of {path.name} is cut ({cells[-1]} of {cells[0]} cells) and was left out.")
+        lines.pop()
+    return rows_of(path, "\n".join(lines), separator)
 
 
 @contextmanager

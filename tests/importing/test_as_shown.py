@@ -284,13 +284,32 @@ def test_quaternions_of_one_length_are_normalised(few, tmp_path):
 def test_the_guess_says_what_no_log_is_and_that_a_long_table_is_to_be_pivoted(few, tmp_path):
     folder, _ = source_of(tmp_path, few, foreign.side_by_side)
     (folder / "readme.txt").write_text("left.avi, right.avi: MJPEG, 6 fps\n")
-    (folder / "log.jsonl").write_text('{"t": 1.0, "x": 2.0}\n')
-    with pytest.raises(FileNotFoundError, match=r"no log of a robot.*no ROS bag.* It has log\.jsonl, readme\.txt\. Convert"):
+    (folder / "log.npy").write_bytes(b"")
+    with pytest.raises(FileNotFoundError, match=r"no log of a robot.*no ROS bag.* It has log\.npy, readme\.txt\. Convert"):
         guess_mapping(folder)
     rows = [f"{t:.3f},{name},{x:.4f},2,3" for t in few.robot_s for x, name in enumerate(("shaft", "left", "right"))]
     (folder / "long.csv").write_text("\n".join(["time_s,landmark,x_mm,y_mm,z_mm", *rows]))
     with pytest.raises(ValueError, match=r"long\.csv: \d+ rows have only \d+ times in 'time_s'; pivot it if rows hold one"):
         guess_mapping(folder)
+
+
+@pytest.mark.parametrize("name", ["robot.jsonl", "robot.json"])
+def test_a_log_of_json_is_read_as_the_table_and_guessed(name, few, tmp_path):
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_poses, lambda *_: HINGE)
+    expected = logs.read_robot(folder, read_mapping(mapping), [])
+    rows = [row.split("\t") for row in (folder / "pose.tsv").read_text().splitlines()[1:]]
+    (folder / "pose.tsv").unlink()
+    entries = [
+        f'{{"header": {{"stamp": {{"secs": {ns[:-9]}, "nsecs": {int(ns[-9:])}}}, "seq": 1}}, "jaw": [{jaw}, null], '
+        f'"pose": {{"position": {{"x": {x},"y": {y}, "z": {z}}}, "orientation": {{"x": {i},"y": {j}, "z": {k}, "w": {w}}}}}}}'
+        for ns, x, y, z, w, i, j, k, jaw in rows
+    ]
+    (folder / name).write_text("\n".join(entries) if name == "robot.jsonl" else f"[{', '.join(entries)}]")
+    guess = guess_mapping(folder).replace("jaw_mm = [0.0, 0.0, 0.0]", "jaw_mm = [1.0, 0.0, 0.0]")
+    mapping.write_text(guess.replace('gripper_unit = "rad"', 'gripper_unit = "deg"'))
+    assert read_mapping(mapping).robot.length_unit == "um" and not read_mapping(mapping).labels
+    for found, wanted in zip(logs.read_robot(folder, read_mapping(mapping), []), expected, strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_the_guess_finds_the_times_of_two_videos_and_a_german_column(few, tmp_path):

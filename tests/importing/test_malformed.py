@@ -50,6 +50,16 @@ def edit(name: str, change):
     return apply
 
 
+def as_json(content: str):
+    """A log of JSON instead, which the mapping names."""
+
+    def apply(folder: Path, text: str) -> str:
+        (folder / "log.jsonl").write_text(content)
+        return text.replace("log.csv", "log.jsonl")
+
+    return apply
+
+
 def told(old: str, new: str):
     """A change of the mapping."""
 
@@ -224,6 +234,10 @@ def labels(kind: str, name: str, data: bytes = b"\x00garbage"):
     return apply
 
 
+def entry(time: object) -> str:
+    return json.dumps({"time_s": time} | {f"{name}_{axis}": 1.0 for name in ("base", "tip_1", "tip_2") for axis in "xyz"})
+
+
 SPOILT = {
     "truncated video": (no_index, r"stereo\.mp4: the video cannot be opened.*[Cc]opy it again"),
     "truncated video without an index": (cut, r"cut\.mkv.*(cut off|cannot be decoded|damaged).*[Cc]opy"),
@@ -245,7 +259,11 @@ SPOILT = {
     "rounded times": (rounded_times, r"log\.csv, line \d: the time repeats .* rounded to 1 s\. .*more digits; .*spread"),
     "empty log": (edit("log.csv", lambda t: t.splitlines()[0] + "\n"), r"log\.csv: the table has no row"),
     "not UTF-8": (bytes_of("log.csv", b"time_s,\x81\n"), r"log\.csv, line 1: the text is not UTF-8"),
-    "JSON lines": (told("log.csv", "log.jsonl"), r"log\.jsonl: only CSV tables and ROS bags .* Convert it to CSV, one row"),
+    "NumPy": (told("log.csv", "log.npy"), r"log\.npy: only CSV tables, JSON .* and ROS bags .* Convert it to CSV, one row"),
+    "JSON that is cut": (as_json('{"t": 1.0}\n{"t": 2'), r"log\.jsonl: not JSON with one object a line, or a list"),
+    "JSON of numbers": (as_json("[1, 2]"), r"log\.jsonl: not JSON with one object a line, or a list of objects"),
+    "JSON without a column": (as_json('{"t": 1.0}\n'), r"log\.jsonl: no column is called 'time_s'; it has \['t'\]"),
+    "text in JSON": (as_json(f"{entry(1.0)}\n\n{entry('late')}\n"), r"log\.jsonl, line 3, column time_s: 'late"),
     "metres called mm": (edit("log.csv", lambda t: _scaled(t, 1e-3)), r"log\.csv.*length_unit"),
     "mm called metres": (told('length_unit = "mm"', 'length_unit = "m"'), r"log\.csv.*moves over .* mm.*length_unit"),
     "ms called s": (edit("log.csv", lambda t: _scaled(t, 1e3, times=True)), r"log\.csv: entries are 400 s apart.*time_unit"),
