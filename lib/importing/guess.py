@@ -25,6 +25,7 @@ _TALL, _WIDE = 1.1, 1.95  # width over height of a film with both views: below, 
 _LOG_STEP_S = 0.4  # longest step of a robot's log in s; steps of a log in ms are longer, up to 2.5 kHz
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|zeit|temps|tiempo|tempo|tijd|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|cm|um|m)?[\])]?$")
+_LISTED = re.compile(r"^(.*)\[([012])\]$")  # of a list of three in JSON
 _ROTATION = re.compile(r"(?i)(^|[ _.\-])r$")  # of rx, ry, rz
 _NO_POINT = re.compile(r"(?i)(^|[ _.\-])([vwf]|vel\w*|speed|acc\w*|force|torque)$")  # of vx, vy, vz and the like
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
@@ -193,6 +194,8 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, tuple], refus
     for column in columns:
         if (match := _AXIS.match(column)) and column not in (*turn.get("rotation", ()), time["time"]):
             groups.setdefault(match[1], {})[match[2].lower()] = column
+        elif (match := _LISTED.match(column)) and f"{match[1]}[3]" not in columns:
+            groups.setdefault(match[1], {})["xyz"[int(match[2])]] = column
     groups = {prefix: axes for prefix, axes in groups.items() if set(axes) == set("xyz") and not _NO_POINT.search(prefix)}
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items()}
     if not turn and len(points) == 2 and (prefix := next(filter(_ROTATION.search, points), None)):

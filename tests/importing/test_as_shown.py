@@ -1,6 +1,8 @@
 """What files state about themselves, or leave out: turned images, lost frames, sentinels, encodings, headers."""
 
+import json
 import struct
+import tomllib
 import warnings
 from dataclasses import replace
 from fractions import Fraction
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lib.correspondences import LANDMARKS
 from lib.importing import guess_mapping, import_recording, logs, read_mapping, video
 from lib.recordings import Recording
 from tests.importing import foreign
@@ -310,6 +313,19 @@ def test_a_log_of_json_is_read_as_the_table_and_guessed(name, few, tmp_path):
     assert read_mapping(mapping).robot.length_unit == "um" and not read_mapping(mapping).labels
     for found, wanted in zip(logs.read_robot(folder, read_mapping(mapping), []), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
+
+
+def test_lists_of_three_in_json_are_guessed_as_positions_and_longer_ones_are_not(few, tmp_path):
+    foreign.side_by_side(tmp_path, few)
+    names = dict(zip(("joint", "jaw left", "jaw right"), LANDMARKS, strict=True))
+    entries = [
+        {"t": time, "q": [0.1, 0.2, 0.3, time], **{name: point.tolist() for name, point in zip(names, x, strict=True)}}
+        for time, x in zip(few.robot_s, few.x_mm, strict=True)
+    ]
+    (tmp_path / "log.json").write_text(json.dumps(entries))
+    robot = tomllib.loads(guess_mapping(tmp_path))["robot"]
+    assert robot["time"] == "t" and robot["length_unit"] == "mm"
+    assert robot["landmarks"] == {ours: [f"{name}[{i}]" for i in range(3)] for name, ours in names.items()}
 
 
 def test_the_guess_finds_the_times_of_two_videos_and_a_german_column(few, tmp_path):
