@@ -42,7 +42,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of each network in a round; usually the time ends a training before.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 41  # version of teaching and training; intermediate results of other versions are not used
+RECIPE = 42  # version of teaching and training; intermediate results of other versions are not used
 #: Share of the remaining time that a round takes, and fewest images for stopping that suffice to fit the error models.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Note if more than half of the log was not smoothed.

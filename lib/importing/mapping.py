@@ -22,7 +22,10 @@ class _Section(BaseModel):
 
 
 class Table(_Section):
-    """A CSV file or a ROS bag, and its column of times.  Columns of a bag are named "/topic:field.of.the.message"."""
+    """A CSV or JSON file or a ROS bag, and its column of times.
+
+    Columns of JSON are named as "pose.position.x" or "joints[0]", those of a bag as "/topic:field.of.the.message".
+    """
 
     file: str
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","

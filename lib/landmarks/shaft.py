@@ -55,8 +55,8 @@ _WIDEST_DEG, _SHARP = 64, 3.0
 #: The edge of the end is sharp, rounded or bevelled.  So the base is a little nearer to the tips than the middle of the
 #: fitted ellipse, by this share of its half axis along the tool, with this standard deviation; the share had a median of
 #: 0.06 to 0.11 in each of five groups of 9 to 12 recordings by other renderers.  A wide shaft that is seen steeply does not
-#: show the base: there this standard deviation is more than the third number, in tool lengths.
-_BEVEL, _BEVEL_SD, _LARGEST_BEVEL_SD = 0.1, 0.15, 0.025
+#: show the base: there this half axis is longer than the third number, in tool lengths.
+_BEVEL, _BEVEL_SD, _LONGEST = 0.1, 0.1, 0.167
 #: Standard deviation of the measured end: a share of the tool's length, and pixels of the image.  The first was chosen on 53
 #: recordings by other renderers; what stands above, on fourteen others and on validation recordings.  The neck of a tapered
 #: shaft goes on into the jaws.
@@ -207,7 +207,7 @@ def shaft_end(recording: Recording, frames: np.ndarray, base: np.ndarray, axes: 
         return None
     shown = _RADII_PX[k] * tangent / _LENGTH_PX  # half axis of the ellipse along the tool, in tool lengths
     clearest = np.mean([score[slope, k, :, i].max() for score in scores])
-    if k == len(_RADII_PX) - 1 or clearest < _LEAST or _BEVEL_SD * shown > _LARGEST_BEVEL_SD:
+    if k == len(_RADII_PX) - 1 or clearest < _LEAST or shown > _LONGEST:
         return None
     before, at, after = best[i - 1 : i + 2]
     moved = (_ALONG_PX[i] + 0.5 * (before - after) / (before - 2 * at + after)) / _LENGTH_PX
