@@ -48,7 +48,7 @@ def guess_mapping(source: str | Path) -> str:
         try:
             tables[name] = _table(paths[name])
         except (ValueError, csv.Error) as error:  # it may be notes in another encoding
-            refused = error
+            refused = refused if name.lower().endswith(".json") else error  # which holds many other things
     robot = _robot(folder, paths, {name: table for name, table in tables.items() if _is_log(*table)}, refused)
     estimate = "pose" in robot and bool(labels)
     robot["offset_s"] = 0.0 if estimate else "estimate"
@@ -138,7 +138,7 @@ def _frame_times(tables: dict[str, tuple], frames: int) -> dict:
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark of a table, and the cells of each column."""
     if path.suffix.lower() in JSON:
-        separator, (header, *rows) = ",", (cells for _, cells in json_rows(path))
+        separator, (header, *rows) = ",", (cells for _, cells in json_rows(path, []))
     else:
         lines = [line for line in uncommented(text_of(path)[0]) if line.strip()] or [","]
         separator = separator_of(lines[0])

@@ -115,26 +115,34 @@ def text_of(path: Path) -> tuple[str, bool]:
         raise refused from None
 
 
-def json_rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+def json_rows(path: Path, notes: list[str]) -> Iterator[tuple[str, list[str]]]:
     """Yield place and cells of header and rows of JSON: one object a line, or one list of objects.
 
-    Columns are named by their path, such as "pose.position.x" or "joints[0]"; a time stamp of ROS is one column.
+    Columns are named by their path, such as "pose.position.x" or "joints[0]"; a time stamp of ROS is one column.  `notes`
+    gets a sentence about a last line that is cut, which is left out.
     """
-    text = decoded(path)
+    text, places, entries = decoded(path, utf_16=True), [f"{path}"], []
     parse = partial(json.loads, parse_float=str, parse_int=str)  # keeps all digits of a time
-    try:
-        if text.lstrip()[:1] == "[":
-            entries = {f"{path}, entry {n}": entry for n, entry in enumerate(parse(text), start=1)}
-        else:
-            lines = enumerate(text.splitlines(), start=1)
-            entries = {f"{path}, line {n}": parse(line) for n, line in lines if line.strip()}
-        rows = {place: dict(_leaves(entry.items())) for place, entry in entries.items()}
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON with one object a line, or a list of objects ({error}).") from None
-    header = list(dict.fromkeys(name for row in rows.values() for name in row))
-    yield str(path), header
-    for place, row in rows.items():
-        yield place, [row.get(name, "") for name in header]
+    listed = text.lstrip()[:1] == "["
+    parts = [text] if listed else text.rstrip().split("\n")
+    for n, part in enumerate(parts, start=1):
+        try:
+            found = parse(part) if part.strip() else []
+        except (ValueError, RecursionError) as error:
+            if n > 2 and n == len(parts) and text[-1] != "\n":
+                notes.append(f"The last line of {path.name} is cut and was left out.")
+                break
+            where = f"{path}, line {n}: not JSON ({error})"
+            raise ValueError(f"{where}. Write one object a line, one for each time, or one list of them.") from None
+        found = found if isinstance(found, list) else [found]
+        entries += found
+        places += [f"{path}, {f'entry {k}' if listed else f'line {n}'}" for k in range(1, len(found) + 1)]
+    if len(entries) < 2 or not all(isinstance(entry, dict) for entry in entries):
+        what = "JSON needs one object a line, one for each time, or one list of them"
+        raise ValueError(f"{path}: {what}. Write it so, or as CSV.")
+    rows = [dict(_leaves(entry.items())) for entry in entries]
+    header = list(dict.fromkeys(name for row in rows for name in row))
+    yield from zip(places, [header, *([row.get(name, "") for name in header] for row in rows)], strict=True)
 
 
 def _leaves(items: Iterable[tuple[str, object]]) -> Iterator[tuple[str, str]]:
@@ -142,7 +150,7 @@ def _leaves(items: Iterable[tuple[str, object]]) -> Iterator[tuple[str, str]]:
     for name, value in items:
         keys = sorted(value, reverse=True) if isinstance(value, dict) else []  # "secs" goes before "nsecs"
         if len(keys) == 2 and all(key in kind for key, kind in zip(keys, _STAMPS, strict=True)):
-            yield name, f"{value[keys[0]]}.{value[keys[1]]:>09}"
+            yield name, f"{value[keys[0]]}.{value[keys[1]]!s:>09}"
         elif isinstance(value, dict):
             yield from _leaves((f"{name}.{key}", inner) for key, inner in value.items())
         elif isinstance(value, list):
@@ -164,7 +172,7 @@ def read_columns(
         what = "only CSV tables, JSON with one object a line and ROS bags are read here"
         raise ValueError(f"{path}: {what}. Convert it to CSV, one row for each time.")
     wanted = [table.time, *names]
-    rows = json_rows(path) if path.suffix.lower() in JSON else _csv_rows(path, table.separator, notes)
+    rows = json_rows(path, notes) if path.suffix.lower() in JSON else _csv_rows(path, table.separator, notes)
     place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:

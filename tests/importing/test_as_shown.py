@@ -288,7 +288,8 @@ def test_the_guess_says_what_no_log_is_and_that_a_long_table_is_to_be_pivoted(fe
     folder, _ = source_of(tmp_path, few, foreign.side_by_side)
     (folder / "readme.txt").write_text("left.avi, right.avi: MJPEG, 6 fps\n")
     (folder / "log.npy").write_bytes(b"")
-    with pytest.raises(FileNotFoundError, match=r"no log of a robot.*no ROS bag.* It has log\.npy, readme\.txt\. Convert"):
+    (folder / "camera.json").write_text('{\n "K": [1, 2]\n}\n')
+    with pytest.raises(FileNotFoundError, match=r"no log of a.* It has camera\.json, log\.npy, readme\.txt\. Convert"):
         guess_mapping(folder)
     rows = [f"{t:.3f},{name},{x:.4f},2,3" for t in few.robot_s for x, name in enumerate(("shaft", "left", "right"))]
     (folder / "long.csv").write_text("\n".join(["time_s,landmark,x_mm,y_mm,z_mm", *rows]))
@@ -313,6 +314,10 @@ def test_a_log_of_json_is_read_as_the_table_and_guessed(name, few, tmp_path):
     assert read_mapping(mapping).robot.length_unit == "um" and not read_mapping(mapping).labels
     for found, wanted in zip(logs.read_robot(folder, read_mapping(mapping), []), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
+    if name == "robot.jsonl":
+        (folder / name).write_text("\n".join([*entries[:-1], entries[-1][:30]]))  # a recorder that was stopped
+        time_s = logs.read_robot(folder, read_mapping(mapping), notes := [])[0]
+        assert len(time_s) == len(entries) - 1 and notes == ["The last line of robot.jsonl is cut and was left out."]
 
 
 def test_lists_of_three_in_json_are_guessed_as_positions_and_longer_ones_are_not(few, tmp_path):
